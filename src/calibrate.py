@@ -3,6 +3,7 @@
 Each task writes its file, its table and its picture into the folder of the run.
 """
 
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -134,6 +135,8 @@ def find_contrast_threshold(cfg: DictConfig, run: Path) -> dict[str, tuple]:
     estimate = contrast_threshold.estimate_contrast_threshold(
         measured, clips, cfg.fps * cfg.data.substeps, pipeline.sensor, progress=track
     )
+    if cfg.clips == 1:
+        warnings.warn("clips=1: the interval holds no difference of scenes", stacklevel=2)
     contrast_threshold.write_threshold_csv(estimate, measured, run / "threshold.csv")
     calibration_figures.draw_event_rates(estimate, run / "threshold.png")
     return {"ON (value, low, high)": estimate.on, "OFF": estimate.off}

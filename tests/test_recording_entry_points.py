@@ -12,6 +12,7 @@ import pytest
 import torch
 from hydra import compose, initialize_config_dir
 
+from src.app import simulation
 from src.calibrate import TASKS, calibrate, describe_resolution
 from src.compare import compare, default_video_names
 from src.figures import comparison
@@ -402,19 +403,27 @@ def test_another_task_is_refused(tmp_path):
         calibrate(config("calibrate", tmp_path / "run", "task=guess", "recording=a.raw"))
 
 
-def test_threshold_of_a_recording_is_found_by_calibrate(folder, found, tmp_path):
-    small = [
-        "scene.height=64",
-        "scene.width=64",
-        "data.test_windows=8",
-        "turbulence=none",
-        "clips=2",
-        "sensor.initial_reference_error=0",
-    ]
-    chosen = [f"recording={folder}/dot.npz", f"views={found}", *small]
-    calibrate(config("calibrate", tmp_path / "run", "task=threshold", *chosen))
-    assert (tmp_path / "run" / "threshold.csv").is_file()
+def test_threshold_of_a_recording_of_the_simulated_clip_is_found_high_by_stray_light(tmp_path):
+    cfg = config(
+        "calibrate", tmp_path / "run", "task=threshold", f"recording={tmp_path}/cap.npz",
+        f"views={tmp_path}/cap.views.yaml", "scene.height=64", "scene.width=64",
+        "scene.speed_widths_per_s=[1.0,1.5]", "data.test_windows=12", "turbulence=none", "sensor=ideal",
+        "sensor.initial_reference_error=0", "clips=1", "fps=120",
+    )  # fmt: skip
+    pipeline = simulation.build_pipeline(cfg, "test")
+    clip, fps = pipeline.render_views([pipeline.draw(0)])[0], cfg.fps * cfg.data.substeps
+    truth = simulated_recording.kaleidoscope_views(
+        list(layout(9)), model=(64, 64), sensor=(220, 220)
+    )
+    sensor = dataclasses.replace(pipeline.sensor, threshold=0.3)
+    simulated_recording.write_recording(tmp_path / "cap.npz", clip, fps, truth, sensor)
+    with pytest.warns(UserWarning, match="clips=1: the interval holds no difference of scenes"):
+        calibrate(cfg)
+    with open(tmp_path / "run" / "threshold.csv") as file:
+        rows = {row["what"]: row for row in csv.DictReader(file)}
     assert (tmp_path / "run" / "threshold.png").is_file()
+    for polarity in ("on", "off"):
+        assert 0.3 < float(rows["estimate"][polarity]) < 1.25 * 0.3
 
 
 def test_comparing_videos_draws_them_and_measures_their_slices(folder, found, tmp_path):
