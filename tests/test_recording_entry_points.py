@@ -407,8 +407,8 @@ def test_threshold_of_a_recording_of_the_simulated_clip_is_found_high_by_stray_l
     cfg = config(
         "calibrate", tmp_path / "run", "task=threshold", f"recording={tmp_path}/cap.npz",
         f"views={tmp_path}/cap.views.yaml", "scene.height=64", "scene.width=64",
-        "scene.speed_widths_per_s=[1.0,1.5]", "data.test_windows=12", "turbulence=none", "sensor=ideal",
-        "sensor.initial_reference_error=0", "clips=1", "fps=120",
+        "scene.speed_widths_per_s=[1.0,1.5]", "data.test_windows=12", "turbulence=none",
+        "sensor=ideal", "sensor.initial_reference_error=0", "clips=1", "fps=120",
     )  # fmt: skip
     pipeline = simulation.build_pipeline(cfg, "test")
     clip, fps = pipeline.render_views([pipeline.draw(0)])[0], cfg.fps * cfg.data.substeps
