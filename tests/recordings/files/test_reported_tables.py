@@ -123,6 +123,34 @@ def test_few_dates_tell_their_unit(tmp_path, events):
     assert np.array_equal(read_events(tmp_path / "a.npz"), few)
 
 
+def write_evreal(folder, events):
+    np.save(folder / "events_ts.npy", events["t"] * 1e-6)
+    np.save(folder / "events_xy.npy", np.stack([events["x"], events["y"]], 1))
+    np.save(folder / "events_p.npy", events["p"] > 0)
+
+
+def write_npz_window(folder, events, name="0.npz"):
+    (folder / "events").mkdir(exist_ok=True)
+    columns = {key: events[key] for key in "txyp"}
+    np.savez(folder / "events" / name, **columns, time_unit="us")
+
+
+@pytest.mark.parametrize("write", [write_evreal, write_npz_window])
+def test_a_folder_that_is_written_anew_is_read_anew(tmp_path, events, write):
+    """Longer, as long but with other times, and much shorter."""
+    later = events.copy()
+    later["t"] += 1_000_000
+    for part in (events[:500], events, later, events[:10]):
+        write(tmp_path, part)
+        assert np.array_equal(quiet_read(tmp_path), part)
+
+
+def test_a_folder_that_grows_is_read_to_its_end(tmp_path, events):
+    for number, part in enumerate(np.array_split(events, 3)):
+        write_npz_window(tmp_path, part, f"{number}.npz")
+        assert len(quiet_read(tmp_path)) >= (number + 1) * (len(events) // 3)
+
+
 def write_windows(path, names, parts):
     with h5py.File(path, "w") as file:
         for name, part in zip(names, parts, strict=True):
