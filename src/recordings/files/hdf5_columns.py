@@ -38,11 +38,21 @@ def find_event_columns(node: Any, order: str | None) -> dict[str, Any]:
         ]
         require_one_time_column(times)
     else:
-        columns = split_table(_Turned(node) if has_event_per_column(node) else node, order)
+        columns = split_table(_upright(node), order)
     start = _find_offset(node)
     if start is not None:
         columns["t"] = LazyColumn(columns["t"], lambda t: as_times(np.asarray(t)) + start)
     return columns
+
+
+def find_nameless_table(node: Any) -> Any:
+    """Return a table without names as (n, columns), of which slices are read; None for others."""
+    is_table = isinstance(node, h5py.Dataset) and node.dtype.names is None
+    return _upright(node) if is_table else None
+
+
+def _upright(table: Any) -> Any:
+    return _Turned(table) if has_event_per_column(table) else table
 
 
 def has_column_shape(key: str, node: Any, is_matlab: bool) -> bool:

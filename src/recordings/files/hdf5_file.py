@@ -37,13 +37,19 @@ from src.recordings.files.hdf5_columns import (
     ConcatenatedColumn,
     are_consecutive_in_time,
     find_event_columns,
+    find_nameless_table,
     find_numbered_streams,
     find_time_unit_by_ms_to_idx,
     has_column_shape,
     list_event_array_shapes,
     read_units_attribute,
 )
-from src.recordings.files.numpy_file import has_event_per_column, slice_columns, slice_times
+from src.recordings.files.numpy_file import (
+    find_order_of_windows,
+    has_event_per_column,
+    slice_columns,
+    slice_times,
+)
 
 HDF5_ENDINGS = (".h5", ".hdf5", ".hdf")
 SIZE_NAMES = ("size", "geometry", "sensor_size")  # width, height
@@ -106,7 +112,10 @@ class Hdf5File(EventFile):
         parts = [part for part in chain(*held) if isinstance(part, h5py.Dataset)]
         check_unpacking_ratio(self.path, sum(part.nbytes for part in parts))
         refuse_ecf_codec(parts)
-        return [find_event_columns(node, options.columns) for node in nodes]
+        order = options.columns
+        if len(nodes) > 1 and order is None:
+            order = find_order_of_windows(map(find_nameless_table, nodes))
+        return [find_event_columns(node, order) for node in nodes]
 
     def _open(self, node: Any, columns: list[dict[str, Any]], options: ReadOptions) -> None:
         """Take the `columns` of all nodes, of which `node` is the first."""

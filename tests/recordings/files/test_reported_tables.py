@@ -183,6 +183,30 @@ def test_windows_of_tables_have_the_columns_that_are_stated(tmp_path, events):
     assert np.array_equal(found["t"], early["t"]) and np.array_equal(found["x"], early["x"])
 
 
+@pytest.mark.parametrize("few", [[], [[9, 1, 0, 1]], [[9, 5, 4, 1], [9, 8, 3, -1]]])
+def test_all_windows_tell_the_order_of_columns(tmp_path, events, few):
+    """Of one event each column can be time; of events at one moment x can, where it ascends."""
+    rows = np.stack([events[name].astype(int) for name in "txyp"], 1)
+    first = np.array(few, int).reshape(-1, 4)
+    parts = [first, *np.array_split(rows, 3), first + np.array([400_000, 0, 0, 0])]
+    (tmp_path / "events").mkdir()
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for number, part in enumerate(parts):
+            file[f"events/{number}"] = part
+            np.savez(tmp_path / "events" / f"{number}.npz", part)
+    for path in (tmp_path / "a.h5", tmp_path):
+        found = quiet_read(path, time_unit="us")
+        wanted = np.concatenate(parts)
+        assert all(np.array_equal(found[name], wanted[:, k]) for k, name in enumerate("txy"))
+
+
+def test_hidden_files_are_no_windows(tmp_path, events):
+    write_npz_window(tmp_path, events)
+    for name in ("._0.npz", ".partial.npz"):
+        (tmp_path / "events" / name).write_bytes(b"PK")
+    assert np.array_equal(quiet_read(tmp_path), events)
+
+
 def test_cameras_with_numbers_are_several_recordings(tmp_path, events):
     write_windows(tmp_path / "a.h5", ["camera0", "camera1"], [events, events[::2]])
     with pytest.warns(UserWarning, match="camera1"):
