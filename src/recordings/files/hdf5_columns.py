@@ -21,6 +21,8 @@ from src.recordings.files.event_file import ReadOptions, refuse_column_order
 from src.recordings.files.numpy_file import LazyColumn, has_event_per_column, split_table
 from src.recordings.files.time_unit import UNITS_US
 
+OF_A_CAMERA = re.compile(r"(?<![a-z])(?:cam|camera|view|sensor)[\W_]*$")  # before a number
+
 
 def find_event_columns(node: Any, order: str | None) -> dict[str, Any]:
     """Return the columns t, x, y, p of a group or a table, times after the `t_offset` beside them
@@ -121,10 +123,13 @@ def has_integer_times(t: Any) -> bool:
 
 def find_numbered_streams(streams: dict[str, Any]) -> list[Any]:
     """Return the streams in order of their number where there are several, called alike but for a
-    number at the end; else none."""
+    number at the end, which is not that of a camera or a view; else none."""
     found = {name: re.fullmatch(r"(.*?)(\d+)", name) for name in streams}
     numbers = {name: (match[1], int(match[2])) for name, match in found.items() if match}
-    if len(streams) < 2 or len(numbers) < len(streams) or len({n for n, _ in numbers.values()}) > 1:
+    stems = {stem for stem, _ in numbers.values()}
+    if len(streams) < 2 or len(numbers) < len(streams) or len(stems) > 1:
+        return []
+    if OF_A_CAMERA.search(stems.pop().lower()):
         return []
     return [streams[name] for name in sorted(streams, key=numbers.__getitem__)]
 

@@ -61,7 +61,7 @@ ECF_CODEC = 36559  # the number of Prophesee's codec
 
 class Hdf5File(EventFile):
     """An HDF5 file with one stream of events, or several, of which one is read; numbered ones that
-    follow in time are one."""
+    follow in time are one, unless they state different sizes or are called cameras or views."""
 
     def __init__(self, path: Path, options: ReadOptions):
         self.path = path
@@ -77,13 +77,18 @@ class Hdf5File(EventFile):
                     + (f", but {found}" if found else "")
                 )
             nodes = find_numbered_streams(streams) if options.stream is None else []
-            columns, self.notes = self._find_columns(nodes, options), ()
-            if not nodes or not are_consecutive_in_time(columns):
+            sizes = {stated[0] for stated in map(_stated_size, nodes) if stated}
+            nodes = [] if len(sizes) > 1 else nodes
+            columns = self._find_columns(nodes, options)
+            if nodes and are_consecutive_in_time(columns):
+                line = f"{len(nodes)} event streams, one after the other, are read as one"
+                self.notes = (f"{path}: {line} (stream= chooses one)",)
+            else:
                 listed = [EventStream(k, name, None) for k, name in enumerate(streams)]
                 chosen, self.notes = choose_stream(path, listed, options.stream)
                 nodes = [streams[chosen.name]]
                 columns = self._find_columns(nodes, options)
-            self._open(nodes[0], columns, options)
+            self._open(nodes, columns, options)
 
     def pieces(self) -> Iterator[RawEvents]:
         yield from slice_columns(self.path, self._columns, self.kept_times)
@@ -117,10 +122,11 @@ class Hdf5File(EventFile):
             order = find_order_of_windows(map(find_nameless_table, nodes))
         return [find_event_columns(node, order) for node in nodes]
 
-    def _open(self, node: Any, columns: list[dict[str, Any]], options: ReadOptions) -> None:
-        """Take the `columns` of all nodes, of which `node` is the first."""
+    def _open(self, nodes: list[Any], columns: list[dict[str, Any]], options: ReadOptions) -> None:
+        """Take the `columns` of all nodes, one after the other."""
+        node = nodes[0]
         self._beside, self._has_own_times = node.parent, isinstance(node, h5py.Group)
-        places = (node, self._file) if self._has_own_times else (node, node.parent, self._file)
+        places = (*nodes, self._file) if self._has_own_times else (*nodes, node.parent, self._file)
         self.size, line = next(filter(None, map(_stated_size, places)), (None, ""))
         self.notes += (f"{self.path}: {line}",) if line else ()
         self._columns: dict[str, Any] = columns[0]
