@@ -19,12 +19,14 @@ def convert(cfg: DictConfig) -> Path:
     """Write the events of `cfg.recording` from `start_s` to `end_s` to `cfg.out`; return it.
 
     Raises ValueError for a recording that cannot be read, a format that cannot be written or cannot
-    hold it, an `out` that cannot be made, and where the one would be written over the other.
+    hold it, an `out` that cannot be made, and where it would be the recording or lie in its folder.
     """
     source, out = Path(cfg.recording), Path(cfg.out)
     for written in (out, partial_path(out)):
         if written.exists() and source.exists() and written.samefile(source):
             raise ValueError(f"out must be another file than recording, got {out}")
+    if source.is_dir() and out.resolve().is_relative_to(source.resolve()):
+        raise ValueError(f"out must lie outside the folder recording={source}, got {out}")
     options = ReadOptions.from_keys(cfg)
     height, width = recording_inputs.find_sensor_size(source, cfg.sensor_size, options)
     how = {"width": width, "height": height, "version": cfg.version, "layout": cfg.layout}

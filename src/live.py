@@ -47,9 +47,9 @@ def live(cfg: DictConfig) -> None:
 def build_server(cfg: DictConfig) -> PageServer:
     """Return the server of the page, with the network and the number of views chosen."""
     faults, name = FaultLog(), str(cfg.ckpt or "baseline")
-    sensor = cfg.sensor_size or (None if cfg.views is None else load_views(cfg.views).sensor)
     how = {"loop": cfg.loop, "udp_format": cfg.udp_format, "options": ReadOptions.from_keys(cfg)}
-    feed = open_feed(cfg.recording, sensor, faults, **how)
+    how["in_views"] = None if cfg.views is None else load_views(cfg.views).sensor
+    feed = open_feed(cfg.recording, cfg.sensor_size, faults, **how)
     views = views_or_whole_sensor(cfg.views, feed.sensor, cfg.resolution)
     networks = load_offered_networks(cfg, name, views.positions)
     settings = RunSettings(cfg.fps, cfg.bins, cfg.splat, cfg.window_length, cfg.form)

@@ -52,7 +52,7 @@ def reconstruct(cfg: DictConfig) -> Path:
     frames, size = make(cfg, network, views)
     shown = show_progress(frames, cfg.start_s + 1 / cfg.fps)
     first = next(shown)  # what is refused is so before a file is made
-    console.print_replaced_path(video)
+    print_replaced_outputs(video)
     with (
         results.store_config_when_done(run, entry_point.resolved_yaml(cfg)),
         output.open_video_writer(cfg.output_format, run, size, cfg.playback_fps) as write,
@@ -64,6 +64,18 @@ def reconstruct(cfg: DictConfig) -> Path:
     said = describe_run(video, size, len(views.views), count, first_s, last_s)
     print(said + suggest_faster_form(cfg, network, last_s))
     return run
+
+
+def print_replaced_outputs(video: Path) -> None:
+    """Print what of `video` and its table is there and will be replaced, and which videos of other
+    formats stay, which the new table does not describe."""
+    table = video.parent / "frames.csv"
+    for path in (video, table):
+        console.print_replaced_path(path)
+    names = sorted({name for _, name in output.KINDS.values()} - {video.name})
+    if others := [name for name in names if (video.parent / name).exists()]:
+        kept = f"{', '.join(others)} of an earlier run"
+        print(f"{video.parent} keeps {kept}; frames.csv and config.yaml will be of {video.name}")
 
 
 def check_settings(cfg: DictConfig) -> None:

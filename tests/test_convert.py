@@ -128,3 +128,17 @@ def test_a_part_without_events_is_refused_and_leaves_no_file(tmp_path, convert):
     with pytest.raises(ValueError, match="recording must have events from 99"):
         convert(f"recording={tmp_path}/in.raw", f"out={tmp_path}/out.npz", "start_s=99")
     assert [file.name for file in tmp_path.glob("out*")] == []
+
+
+@pytest.mark.parametrize("recording", ["scene", "scene/events"])
+def test_nothing_is_written_into_the_folder_that_is_read(tmp_path, convert, recording):
+    (tmp_path / "scene/events").mkdir(parents=True)
+    events = made_up(3000)
+    columns = {name: events[name] for name in "txyp"} | {"size": [640, 480], "time_unit": "us"}
+    np.savez(tmp_path / "scene/events/0.npz", **columns)
+    given = f"recording={tmp_path}/{recording}"
+    with pytest.raises(ValueError, match=f"out must lie outside the folder {given}, got .*cap.npz"):
+        convert(given, f"out={tmp_path}/scene/events/cap.npz")
+    convert(given, f"out={tmp_path}/cap.npz")
+    for path in (tmp_path / recording, tmp_path / "cap.npz"):
+        assert np.array_equal(read_events(path), events)

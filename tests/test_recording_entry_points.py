@@ -191,6 +191,10 @@ def test_what_a_run_replaces_is_said_and_no_frame_of_it_stays(folder, tmp_path, 
     said = capsys.readouterr().out
     assert f"{run}/frames, 60 files, is there and will be replaced\n" in said
     assert 0 < len(list((run / "frames").iterdir())) < 60
+    reconstruct(config("reconstruct", run, *chosen, "output_format=hdf5"))
+    lines = capsys.readouterr().out.splitlines()[:2]
+    kept = f"{run} keeps frames of an earlier run; frames.csv and config.yaml will be of video.h5"
+    assert lines == [f"{run}/frames.csv is there and will be replaced", kept]
 
 
 def test_the_line_of_a_run_counts_one_and_says_what_the_first_frame_took():

@@ -54,16 +54,18 @@ def open_feed(
     loop: bool = False,
     udp_format: str = "t64_x16_y16_on8",
     options: ReadOptions = ReadOptions(),
+    in_views: HeightWidth | None = None,
 ) -> Feed:
     """Return the feed of `recording`: a path, `udp://address:port` or `camera://`; `sensor`:
-    (height, width) where it states none.  Raises ValueError for what cannot be read or holds no
-    event, and for a `udp_format` that is none of PACKETS."""
+    (height, width), before what a file states; `in_views`: that of the views, where neither says.
+    Raises ValueError for what cannot be read or holds no event, and for a `udp_format` that is none
+    of PACKETS."""
     if udp_format not in PACKETS:
         raise ValueError(f"udp_format must be one of {', '.join(PACKETS)}, got {udp_format}")
     if recording.startswith("camera://"):
         return CameraFeed(faults)
     if not recording.startswith("udp://"):
-        size = recording_inputs.find_sensor_size(recording, sensor, options)
+        size = recording_inputs.find_sensor_size(recording, sensor, options, in_views)
         opened = open_recording(recording, size, options)
         opened.check_sensor_size()
         if next(iter(opened), None) is None:
@@ -71,6 +73,7 @@ def open_feed(
         if lines := opened.messages:
             faults.report("reading", "; ".join(lines), until_cleared=True)
         return FileFeed(opened, size, loop)
+    sensor = sensor or in_views
     if sensor is None or not are_sensor_sides(sensor):
         raise ValueError(
             f"sensor_size must be [height,width] for recording=udp://, got {sensor}; "

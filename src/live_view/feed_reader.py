@@ -22,7 +22,7 @@ from src.live_view.live_windows import (
     WindowQueue,
 )
 from src.live_view.status import FaultLog, Meters
-from src.recordings.event_windows import COVERED
+from src.recordings.event_windows import COVERED, describe_short_recording
 from src.recordings.files.event_arrays import concatenate_events
 from src.recordings.files.event_file import EVENT
 from src.recordings.files.event_order import BUFFER_US
@@ -218,11 +218,21 @@ class FeedReader:
             if due_s is None:
                 break
             self._hand_on(window, due_s, stopped)
+        if chunk in (AGAIN, "ended"):
+            self._report_short_recording()
         if chunk == AGAIN:  # nothing of the end is left when the recording starts again
             self.cutter.restart()
             self.clock.anchor = None
         elif isinstance(chunk, str):
             self.state = chunk
+
+    def _report_short_recording(self) -> None:
+        """Say that the recording, which is over, was no window long, if so."""
+        start_us = self.cutter.origin_us
+        if start_us is not None and not self.cutter.windows_cut:
+            length_s = (self.cutter.last_us - start_us) * 1e-6
+            line = describe_short_recording(self.cutter.fps, length_s)
+            self.faults.report("file", line, until_cleared=True)
 
     def _cut_live(
         self, chunk: tuple[np.ndarray, float] | str | None, now_s: float, stopped: threading.Event

@@ -201,7 +201,12 @@ def _explain_no_window(rule: WindowRule, chunks: _OrderedChunks) -> str:
     if length_s > 1 / rule.fps and rule.start_s:
         wanted = f"leave {window} of the recording, {length_s:.3f} s long"
         return f"start_s and end_s must {wanted}, {given}"
-    return f"recording must be longer than {window}, got {length_s:g} s"
+    return describe_short_recording(rule.fps, length_s)
+
+
+def describe_short_recording(fps: float, length_s: float) -> str:
+    """Return the error of a recording of `length_s` in which no window of 1 / `fps` is whole."""
+    return f"recording must be longer than one window of 1/{fps:g} s, got {length_s:g} s"
 
 
 def cut_windows_backward(

@@ -37,6 +37,7 @@ from src.recordings.files.recording import read_events
 from src.recordings.sensor_lookup import build_lookup
 from tests.live_view import scenes
 from tests.live_view.browser import free_port
+from tests.test_recording_entry_points import config
 
 
 @pytest.fixture(scope="module")
@@ -112,6 +113,20 @@ def test_a_recording_off_the_given_sensor_is_refused(tmp_path):
     (tmp_path / "events.txt").write_text("\n".join(lines))
     with pytest.raises(ValueError, match="all 50 events are off the 10x10 sensor"):
         event_feeds.open_feed(str(tmp_path / "events.txt"), (10, 10), FaultLog())
+
+
+def test_views_of_another_sensor_than_the_recordings_are_refused(tmp_path):
+    scenes.views().save(tmp_path / "views.yaml")
+    events = scenes.events(0.02)[:200]
+    columns = {name: events[name] for name in "tp"} | dict.fromkeys("xy", np.arange(200) % 40)
+    given = ["ckpt=setnet_small", f"views={tmp_path}/views.yaml", f"recording={tmp_path}/a.npz"]
+    columns["time_unit"] = "us"
+    np.savez(tmp_path / "a.npz", **columns, size=[64, 48])
+    with pytest.raises(ValueError, match=r"sensor must be .* \(48, 64\), got \(360, 640\)"):
+        live.build_server(config("live", tmp_path / "run", *given))
+    np.savez(tmp_path / "a.npz", **columns)
+    server = live.build_server(config("live", tmp_path / "run", *given))
+    assert server.page.player.reader.feed.sensor == scenes.SENSOR == (360, 640)
 
 
 def test_a_recording_without_events_is_refused(tmp_path):
@@ -409,6 +424,17 @@ def test_as_fast_as_it_goes_every_picture_is_that_of_reconstruct(recording):
     shown = screen.ring[: screen.count].astype(float)
     assert np.abs(shown - wanted[: screen.count]).max() <= 1 and shown.std() > 1
     assert len(wanted) - screen.count in (0, 1)
+
+
+def test_a_recording_shorter_than_a_window_is_said_so(tmp_path):
+    height, width = scenes.SENSOR
+    write_events(tmp_path / "a.npz", scenes.events(0.01)[:1], width=width, height=height)
+    player = served(str(tmp_path / "a.npz"), {"net": SetNet.preset("small").eval()}).page.player
+    player.start()
+    _until(lambda: player.reader.state == "ended")
+    player.stop()
+    line = "recording must be longer than one window of 1/100 s, got 0 s"
+    assert player.reader.faults.current() == [line]
 
 
 def test_a_silence_is_that_of_the_network_on_every_window():

@@ -17,7 +17,8 @@ Map = Float[np.ndarray, "h w"]
 
 
 def leave_out_blocked_views(grid: ViewGrid, pictures: Pictures) -> ViewGrid:
-    """Return the grid without the views that show next to nothing; warn of them.
+    """Return the grid without the views that show next to nothing; warn of them, but for rows and
+    columns of margins (`_trim_dark_margins`).
 
     Raises ValueError where the centre view is one, or fewer than MIN_OTHERS others are left.
     """
@@ -33,8 +34,22 @@ def leave_out_blocked_views(grid: ViewGrid, pictures: Pictures) -> ViewGrid:
             f"recording must show the centre view and {MIN_OTHERS} others: next to nothing is seen"
             f" in {names} of {len(shown)} views, which may be blocked"
         )
-    warnings.warn(f"next to nothing is seen in view {names}, which is left out", stacklevel=3)
-    return replace(grid, left_out=tuple(dark))
+    grid = _trim_dark_margins(grid, dark)
+    if blocked := tuple(at for at in dark if at in grid.positions):
+        names = " and ".join(map(str, blocked))
+        warnings.warn(f"next to nothing is seen in view {names}, which is left out", stacklevel=3)
+    return replace(grid, left_out=blocked)
+
+
+def _trim_dark_margins(grid: ViewGrid, dark: list[Position]) -> ViewGrid:
+    """Return the grid without its first and last row, and column, while all views of both are
+    `dark`: there the sensor goes on beyond the views."""
+    for name, side in (("y", 0), ("x", 1)):
+        axis = getattr(grid, name)
+        while {at for at in grid.positions if at[side] in axis.outer_offsets} <= {*dark}:
+            axis = replace(axis, start=axis.start + axis.pitch, count=axis.count - 2)
+            grid = replace(grid, **{name: axis})
+    return grid
 
 
 def share_of_events_outside_views(grid: ViewGrid, pictures: Pictures) -> float:

@@ -45,6 +45,11 @@ class ViewAxis:
         return (self.count - 1) // 2
 
     @property
+    def outer_offsets(self) -> tuple[int, int]:
+        """Return how many views the first and the last are from the centre one."""
+        return -self.centre_index, self.count - 1 - self.centre_index
+
+    @property
     def centre_view_edges(self) -> tuple[float, float]:
         """Where the centre view begins and ends."""
         begin = self.start + self.centre_index * self.pitch

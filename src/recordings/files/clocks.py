@@ -10,6 +10,7 @@ from src.recordings.files.event_file import PIECE_EVENTS, RawEvents
 
 BLOCK_BYTES = 2**20
 LEAST_ZEROS = 64  # bytes at the end that are no events, but were never written
+NEARLY_A_TURN = 0.98  # of a counter's turn, by which a late event from before its end rises
 
 
 def read_whole_words(
@@ -47,7 +48,9 @@ def find_end_before_zeros(path: Path, start: int) -> tuple[int, int]:
 
 
 class TimestampUnwrapper:
-    """A counter of `bits`, read in pieces: it went round where it falls by more than half."""
+    """A counter of `bits`, read in pieces: it went round where it falls by more than half.
+
+    A rise of NEARLY_A_TURN or more after that is a late event, of the round before."""
 
     def __init__(self, bits: int = 32):
         self._bits, self._last, self._rounds = bits, 0, 0
@@ -56,11 +59,19 @@ class TimestampUnwrapper:
         """Return the times (n,) as int64 with the rounds since the first piece."""
         times = t.astype(np.int64)
         if len(times):
-            has_wrapped = np.diff(times, prepend=self._last) < -(1 << self._bits - 1)
-            rounds = np.cumsum(has_wrapped) + self._rounds
-            self._last, self._rounds = int(times[-1]), int(rounds[-1])
-            times += rounds << self._bits
+            steps, turn = np.diff(times, prepend=self._last), 1 << self._bits
+            self._last = int(times[-1])
+            times += self._count_rounds(steps < -(turn >> 1), steps >= NEARLY_A_TURN * turn) * turn
         return times
+
+    def _count_rounds(self, is_next: np.ndarray, is_before: np.ndarray) -> np.ndarray | int:
+        """Return the rounds, never below 0, at events that begin the next or go back by one."""
+        if not (is_next.any() or (self._rounds and is_before.any())):
+            return self._rounds
+        rounds = self._rounds + np.cumsum(is_next.astype(np.int64) - is_before)
+        rounds -= np.minimum.accumulate(np.minimum(rounds, 0))
+        self._rounds = int(rounds[-1])
+        return rounds
 
 
 def merge_small_pieces(pieces: Iterator[RawEvents]) -> Iterator[RawEvents]:

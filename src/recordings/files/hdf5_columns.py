@@ -21,6 +21,8 @@ from src.recordings.files.event_file import ReadOptions, refuse_column_order
 from src.recordings.files.numpy_file import LazyColumn, has_event_per_column, split_table
 from src.recordings.files.time_unit import UNITS_US
 
+OF_A_CAMERA = re.compile(r"(?<![a-z])(?:cam|camera|view|sensor)[\W_]*$")  # before a number
+
 
 def find_event_columns(node: Any, order: str | None) -> dict[str, Any]:
     """Return the columns t, x, y, p of a group or a table, times after the `t_offset` beside them
@@ -38,11 +40,21 @@ def find_event_columns(node: Any, order: str | None) -> dict[str, Any]:
         ]
         require_one_time_column(times)
     else:
-        columns = split_table(_Turned(node) if has_event_per_column(node) else node, order)
+        columns = split_table(_upright(node), order)
     start = _find_offset(node)
     if start is not None:
         columns["t"] = LazyColumn(columns["t"], lambda t: as_times(np.asarray(t)) + start)
     return columns
+
+
+def find_nameless_table(node: Any) -> Any:
+    """Return a table without names as (n, columns), of which slices are read; None for others."""
+    is_table = isinstance(node, h5py.Dataset) and node.dtype.names is None
+    return _upright(node) if is_table else None
+
+
+def _upright(table: Any) -> Any:
+    return _Turned(table) if has_event_per_column(table) else table
 
 
 def has_column_shape(key: str, node: Any, is_matlab: bool) -> bool:
@@ -111,10 +123,13 @@ def has_integer_times(t: Any) -> bool:
 
 def find_numbered_streams(streams: dict[str, Any]) -> list[Any]:
     """Return the streams in order of their number where there are several, called alike but for a
-    number at the end; else none."""
+    number at the end, which is not that of a camera or a view; else none."""
     found = {name: re.fullmatch(r"(.*?)(\d+)", name) for name in streams}
     numbers = {name: (match[1], int(match[2])) for name, match in found.items() if match}
-    if len(streams) < 2 or len(numbers) < len(streams) or len({n for n, _ in numbers.values()}) > 1:
+    stems = {stem for stem, _ in numbers.values()}
+    if len(streams) < 2 or len(numbers) < len(streams) or len(stems) > 1:
+        return []
+    if OF_A_CAMERA.search(stems.pop().lower()):
         return []
     return [streams[name] for name in sorted(streams, key=numbers.__getitem__)]
 

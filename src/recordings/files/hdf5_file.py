@@ -37,13 +37,19 @@ from src.recordings.files.hdf5_columns import (
     ConcatenatedColumn,
     are_consecutive_in_time,
     find_event_columns,
+    find_nameless_table,
     find_numbered_streams,
     find_time_unit_by_ms_to_idx,
     has_column_shape,
     list_event_array_shapes,
     read_units_attribute,
 )
-from src.recordings.files.numpy_file import has_event_per_column, slice_columns, slice_times
+from src.recordings.files.numpy_file import (
+    find_order_of_windows,
+    has_event_per_column,
+    slice_columns,
+    slice_times,
+)
 
 HDF5_ENDINGS = (".h5", ".hdf5", ".hdf")
 SIZE_NAMES = ("size", "geometry", "sensor_size")  # width, height
@@ -55,7 +61,7 @@ ECF_CODEC = 36559  # the number of Prophesee's codec
 
 class Hdf5File(EventFile):
     """An HDF5 file with one stream of events, or several, of which one is read; numbered ones that
-    follow in time are one."""
+    follow in time are one, unless they state different sizes or are called cameras or views."""
 
     def __init__(self, path: Path, options: ReadOptions):
         self.path = path
@@ -71,13 +77,18 @@ class Hdf5File(EventFile):
                     + (f", but {found}" if found else "")
                 )
             nodes = find_numbered_streams(streams) if options.stream is None else []
-            columns, self.notes = self._find_columns(nodes, options), ()
-            if not nodes or not are_consecutive_in_time(columns):
+            sizes = {stated[0] for stated in map(_stated_size, nodes) if stated}
+            nodes = [] if len(sizes) > 1 else nodes
+            columns = self._find_columns(nodes, options)
+            if nodes and are_consecutive_in_time(columns):
+                line = f"{len(nodes)} event streams, one after the other, are read as one"
+                self.notes = (f"{path}: {line} (stream= chooses one)",)
+            else:
                 listed = [EventStream(k, name, None) for k, name in enumerate(streams)]
                 chosen, self.notes = choose_stream(path, listed, options.stream)
                 nodes = [streams[chosen.name]]
                 columns = self._find_columns(nodes, options)
-            self._open(nodes[0], columns, options)
+            self._open(nodes, columns, options)
 
     def pieces(self) -> Iterator[RawEvents]:
         yield from slice_columns(self.path, self._columns, self.kept_times)
@@ -106,12 +117,16 @@ class Hdf5File(EventFile):
         parts = [part for part in chain(*held) if isinstance(part, h5py.Dataset)]
         check_unpacking_ratio(self.path, sum(part.nbytes for part in parts))
         refuse_ecf_codec(parts)
-        return [find_event_columns(node, options.columns) for node in nodes]
+        order = options.columns
+        if len(nodes) > 1 and order is None:
+            order = find_order_of_windows(map(find_nameless_table, nodes))
+        return [find_event_columns(node, order) for node in nodes]
 
-    def _open(self, node: Any, columns: list[dict[str, Any]], options: ReadOptions) -> None:
-        """Take the `columns` of all nodes, of which `node` is the first."""
+    def _open(self, nodes: list[Any], columns: list[dict[str, Any]], options: ReadOptions) -> None:
+        """Take the `columns` of all nodes, one after the other."""
+        node = nodes[0]
         self._beside, self._has_own_times = node.parent, isinstance(node, h5py.Group)
-        places = (node, self._file) if self._has_own_times else (node, node.parent, self._file)
+        places = (*nodes, self._file) if self._has_own_times else (*nodes, node.parent, self._file)
         self.size, line = next(filter(None, map(_stated_size, places)), (None, ""))
         self.notes += (f"{self.path}: {line}",) if line else ()
         self._columns: dict[str, Any] = columns[0]

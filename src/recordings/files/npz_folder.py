@@ -5,6 +5,7 @@ layout of TimeLens's recordings (HS-ERGB, BS-ERGB; Tulyakov et al. 2021, 2022) a
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
@@ -12,18 +13,27 @@ import numpy as np
 
 from src.recordings.files.event_file import EventFile, RawEvents, RawFrames, ReadOptions
 from src.recordings.files.frame_files import find_timelens_frames
-from src.recordings.files.numpy_file import NumpyFile
+from src.recordings.files.numpy_file import (
+    ENOUGH_EVENTS,
+    NumpyFile,
+    find_order_of_windows,
+    read_nameless_table,
+)
 from src.sim.scenes.video_files import sort_naturally
 
 EVENT_FOLDERS = (".", "events", "events_aligned")
 FRACTIONS = 32  # of a pixel in which BS-ERGB has x and y, in 16 bits
-ENOUGH_EVENTS = 10_000  # that tell whether coordinates are such fractions
 
 
 def find_npz_folder(path: Path) -> Path | None:
     """Return the folder of .npz files that `path` is or has; None where there is none."""
     folders = (path / name for name in EVENT_FOLDERS)
-    return next((folder for folder in folders if any(folder.glob("*.npz"))), None)
+    return next((folder for folder in folders if _list_npz(folder)), None)
+
+
+def _list_npz(folder: Path) -> list[Path]:
+    """Return the .npz files of a folder, but hidden ones, in order of name."""
+    return sort_naturally(path for path in folder.glob("*.npz") if path.name[0] != ".")
 
 
 class NpzFolder(EventFile):
@@ -34,10 +44,11 @@ class NpzFolder(EventFile):
     """
 
     def __init__(self, path: Path, options: ReadOptions):
-        self.path, self._options = path, options
-        self._folder = find_npz_folder(path) or path
-        self._names = sort_naturally(self._folder.glob("*.npz"))
-        first = NumpyFile(self._names[0], options)
+        self.path, self._folder = path, find_npz_folder(path) or path
+        self._names = _list_npz(self._folder)
+        tables = (read_nameless_table(name, options) for name in self._names)
+        self._options = replace(options, columns=options.columns or find_order_of_windows(tables))
+        first = NumpyFile(self._names[0], self._options)
         self.size, self.notes, self.time_unit = first.size, first.notes, first.time_unit
 
     def pieces(self) -> Iterator[RawEvents]:

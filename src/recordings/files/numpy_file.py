@@ -1,7 +1,8 @@
 """Events in NumPy files: .npy and .npz, nothing of which is executed."""
 
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from operator import itemgetter
 from pathlib import Path
@@ -36,6 +37,7 @@ from src.recordings.files.event_file import (
 )
 from src.recordings.files.time_unit import UNITS_US
 
+ENOUGH_EVENTS = 10_000  # of windows, that tell the order of columns or parts of pixels
 LEAST_COLUMNS = 16  # of a table of four rows, from which these are the columns of events
 
 
@@ -56,9 +58,7 @@ class NumpyFile(EventFile):
                 self._columns = split_table(table, options.columns)
                 self.time_unit = find_named_time_unit(table.dtype.names, options)
             else:
-                with zipfile.ZipFile(path) as archive:
-                    check_unpacking_ratio(path, sum(part.file_size for part in archive.infolist()))
-                with np.load(path) as file:
+                with _open_npz(path) as file:
                     self.size = find_npz_size(file)
                     self._columns, names, self.notes = _columns_of(path, file, options)
                     self.time_unit = _find_stated_unit(file)
@@ -72,6 +72,44 @@ class NumpyFile(EventFile):
 
     def times(self) -> Iterator[np.ndarray]:
         yield from slice_times(self.path, self._columns["t"])
+
+
+@contextmanager
+def _open_npz(path: Path) -> Iterator[Any]:
+    """Open an .npz that unpacks to what is believed of its size."""
+    with zipfile.ZipFile(path) as archive:
+        check_unpacking_ratio(path, sum(part.file_size for part in archive.infolist()))
+    with np.load(path) as file:
+        yield file
+
+
+def read_nameless_table(path: Path, options: ReadOptions) -> np.ndarray | None:
+    """Return the table (n, columns) of an .npz whose columns have no names; None for another."""
+    with name_file_in_errors(path, "cannot be read as arrays of events"), _open_npz(path) as file:
+        if find_keys_by_name(file.files) is not None:
+            return None
+        table, _ = _find_table(path, file, options)
+        if table.dtype.names is not None:
+            return None
+        return table.T if has_event_per_column(table) else table
+
+
+def find_order_of_windows(tables: Iterable[Any]) -> str | None:
+    """Return the order (columns=) that the first events of windows, tables (n, columns) without
+    names, tell together; None where they do not, or one of them is None."""
+    samples: list[np.ndarray] = []
+    for table in tables:
+        if table is None:
+            return None
+        samples.append(np.asarray(table[:PIECE_EVENTS]))
+        if sum(map(len, samples)) >= ENOUGH_EVENTS:
+            break
+    try:
+        places = find_columns(np.concatenate(samples).astype(np.float64), None)
+    except (ValueError, TypeError):  # said of the window that is read first
+        return None
+    letters = {place: letter for letter, place in places.items()}
+    return "".join(letters.get(place, "_") for place in range(max(letters) + 1))
 
 
 def find_npz_size(file: Any) -> WidthHeight | None:
@@ -180,14 +218,19 @@ def _columns_of(
         count = len(columns["t"])
         require_one_time_column([keys["t"], *(name for name in others if file[name].size == count)])
         return columns, file.files, ()
+    table, notes = _find_table(path, file, options)
+    return split_table(table, options.columns), table.dtype.names, notes
+
+
+def _find_table(path: Path, file: Any, options: ReadOptions) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return the array of events of an .npz, and a note of others in it."""
     for is_called_events in (True, False):
         names = [name for name in file.files if ("event" in name.lower()) == is_called_events]
         tables = {name: table for name in names if _is_table(table := file[name])}
         if tables:
             streams = [EventStream(place, name, None) for place, name in enumerate(tables)]
             chosen, notes = choose_stream(path, streams, options.stream)
-            table = tables[chosen.name]
-            return split_table(table, options.columns), table.dtype.names, notes
+            return tables[chosen.name], notes
     raise ValueError(f"no columns t, x, y, p and no array of events among {', '.join(file.files)}")
 
 

@@ -4,6 +4,7 @@ What is wrong with a file is an error that names it, or a warning with the numbe
 concerned.
 """
 
+import os
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from copy import copy
@@ -31,8 +32,9 @@ from src.recordings.files.event_file import (
 )
 from src.recordings.files.event_order import EventSorter, merge_in_time
 from src.recordings.files.evreal_folder import EvrealFolder, is_evreal_folder
+from src.recordings.files.frame_files import PICTURE_FOLDERS
 from src.recordings.files.hdf5_file import HDF5_ENDINGS, Hdf5File
-from src.recordings.files.npz_folder import NpzFolder, find_npz_folder
+from src.recordings.files.npz_folder import EVENT_FOLDERS, NpzFolder, find_npz_folder
 from src.recordings.files.numpy_file import NumpyFile
 from src.recordings.files.prophesee_file import PropheseeFile
 from src.recordings.files.rosbag_file import RosbagFile, is_bag_folder
@@ -51,6 +53,7 @@ from src.recordings.files.text_layout import TEXT_ENDINGS
 from src.recordings.files.time_unit import check_times, to_us
 
 Reader = Callable[[Path, ReadOptions], EventFile]
+FileState = tuple[str, int, int]
 READERS: dict[str, Reader] = {  # by the ending, in small letters
     ".raw": PropheseeFile, ".dat": PropheseeFile, ".aedat4": Aedat4File, ".aedat": Aedat1To3File,
     ".aedat2": Aedat1To3File, ".es": EsFile, ".bag": RosbagFile, ".db3": RosbagFile,
@@ -112,8 +115,7 @@ def open_recording(
     path = Path(path)
     if find_folder_reader(path) is None and (not path.is_file() or path.stat().st_size == 0):
         raise ValueError(f"recording must be an event file, got {path}: {_why_not_a_file(path)}")
-    state = path.stat()
-    kept, survey, swapped = _open_and_survey(path, state.st_mtime_ns, state.st_size, options)
+    kept, survey, swapped = _open_and_survey(path, find_file_states(path), options)
     file = _open_file(path, options) if kept is None else copy(kept)
     file.kept_times = survey.times
     given = None if sensor_size is None else check_sensor_size(sensor_size)
@@ -253,6 +255,19 @@ def find_folder_reader(path: Path) -> Reader | None:
     return next((reader for reader, is_one in kinds.items() if is_one(path)), None)
 
 
+def find_file_states(path: Path) -> tuple[FileState, ...]:
+    """Return path, time of change in ns and bytes of a file, or of those that a folder is read
+    from: in it, in its folders of events and pictures, and of pictures beside it."""
+    files: Iterable[Path | os.DirEntry] = (path,)
+    if path.is_dir():
+        events = (path / name for name in EVENT_FOLDERS)
+        pictures = (place / name for place in (path, path.parent) for name in PICTURE_FOLDERS)
+        folders = dict.fromkeys(filter(Path.is_dir, (*events, *pictures)))
+        files = (file for folder in folders for file in os.scandir(folder) if file.is_file())
+    states = ((os.fspath(file), file.stat()) for file in files)
+    return tuple(sorted((name, state.st_mtime_ns, state.st_size) for name, state in states))
+
+
 def _open_file(path: Path, options: ReadOptions) -> EventFile:
     ending = "".join(path.suffixes[-2:]).lower()
     reader = READERS.get(ending) or READERS.get(path.suffix.lower())
@@ -280,9 +295,9 @@ def _open_file(path: Path, options: ReadOptions) -> EventFile:
 
 @lru_cache(maxsize=1)
 def _open_and_survey(
-    path: Path, changed_ns: int, length: int, options: ReadOptions
+    path: Path, states: tuple[FileState, ...], options: ReadOptions
 ) -> tuple[EventFile | None, TimeSurvey, WidthHeight | None]:
-    """Return what is opened, once for a file that does not change, what its times tell, and the
+    """Return what is opened, once for files that do not change, what its times tell, and the
     size that its events show where it is stated the wrong way round (find_swapped_size).
 
     Instead of an HDF5 file None: an open one cannot be written.

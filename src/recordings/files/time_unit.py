@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from src.recordings.files.clocks import TimestampUnwrapper
+from src.recordings.files.clocks import NEARLY_A_TURN, TimestampUnwrapper
 
 UNITS_US = {"s": 1e6, "ms": 1e3, "us": 1.0, "ns": 1e-3}
 PRIOR = {
@@ -43,7 +43,6 @@ FEW_TIMES = 100
 SAMPLES = 1024  # of a piece
 MAX_TIME_US = 2**62
 COUNTER_BITS = (24, 31, 32)  # of counters that go round
-FALL = 0.98  # of its turn that a counter falls by, at least, before FEW_TIMES others or more
 Range = tuple[float, float]
 
 
@@ -55,7 +54,8 @@ class TimeSample:
         self.count, self.are_whole_numbers, self.are_apart_by_thousands = 0, True, True
         self._values: list[np.ndarray] = []
         self._last: Any = None
-        self._steps: Range = (0, 0)  # least and most
+        self._most_fall = 0
+        self._most_rise = dict.fromkeys(COUNTER_BITS, 0)  # but of late events of such a counter
         self._first_fall: int | None = None  # the place of a time that far below the one before
         self._range: Range = (np.inf, -np.inf)
 
@@ -70,27 +70,36 @@ class TimeSample:
             if self.are_whole_numbers:
                 self.are_whole_numbers = bool((t == np.rint(t)).all())
         else:
-            steps = np.diff(t, prepend=first)
-            self._steps = _widen(self._steps, steps)
             self._range = _widen(self._range, t)
-            is_fall = steps < -FALL * 2 ** COUNTER_BITS[0]
-            if self._first_fall is None and is_fall.any():
-                self._first_fall = self.count + int(is_fall.argmax())
+            self._add_steps(np.diff(t, prepend=first))
         if self.are_apart_by_thousands:
             self.are_apart_by_thousands = not (np.diff(values, prepend=first) % 1000).any()
         self._last, self.count = t[-1], self.count + len(t)
+
+    def _add_steps(self, steps: np.ndarray) -> None:
+        """Take the steps (n,) to the times of a piece of whole numbers."""
+        self._most_fall = min(self._most_fall, int(steps.min()))
+        is_fall = steps < -NEARLY_A_TURN * 2 ** COUNTER_BITS[0]
+        if self._first_fall is None and is_fall.any():
+            self._first_fall = self.count + int(is_fall.argmax())
+        start = len(steps) if self._first_fall is None else max(0, self._first_fall - self.count)
+        for bits, most in self._most_rise.items():
+            is_late = steps[start:] >= NEARLY_A_TURN * 2**bits
+            rises = [steps[:start].max(initial=0), steps[start:].max(initial=0, where=~is_late)]
+            self._most_rise[bits] = max(most, *map(int, rises))
 
     @property
     def wrap_bits(self) -> int:
         """Return of how many bits a counter is that falls from its end to its beginning and goes on
         from there; else 0."""
-        (down, up), (least, most) = self._steps, self._range
+        least, most = self._range
         follow = 0 if self._first_fall is None else self.count - self._first_fall
         if follow < FEW_TIMES or self._last == least:  # at the end may be zeros
             return 0
         for bits in COUNTER_BITS:
-            turn = 2**bits
-            if most - least < turn and down < -FALL * turn and up < 0.5 * turn:
+            turn, rise = 2**bits, self._most_rise[bits]
+            has_fallen = self._most_fall < -NEARLY_A_TURN * turn
+            if most - least < turn and has_fallen and rise < 0.5 * turn:
                 return bits
         return 0
 

@@ -2,6 +2,7 @@
 
 import re
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -100,6 +101,19 @@ def test_a_blocked_view_is_left_out():
     with pytest.warns(UserWarning, match=r"^next to nothing is seen in view \(1, 1\), which is"):
         left = leave_out_blocked_views(grid, pictures)
     assert left.positions == [at for at in grid.positions if at != (1, 1)]
+
+
+@pytest.mark.parametrize("blocked", [(), ((1, 1),)])
+def test_margins_of_the_sensor_are_no_blocked_views(blocked):
+    pictures = show_views(blocked=blocked)
+    grid = view_grid.find_grid(pictures)
+    wide = np.pad(pictures, ((0, 0), (0, 0), (0, 0), (SIDE, SIDE)), constant_values=100)
+    widened = replace(grid, x=replace(grid.x, count=5))
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        found = leave_out_blocked_views(widened, wide)
+    moved = replace(grid.x, start=grid.x.start + grid.x.pitch)
+    assert found == replace(grid, x=moved, left_out=blocked) and len(told) == len(blocked)
 
 
 def test_a_blocked_centre_view_is_refused():

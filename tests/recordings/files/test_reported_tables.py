@@ -123,22 +123,61 @@ def test_few_dates_tell_their_unit(tmp_path, events):
     assert np.array_equal(read_events(tmp_path / "a.npz"), few)
 
 
-def write_windows(path, names, parts):
+def write_evreal(folder, events):
+    np.save(folder / "events_ts.npy", events["t"] * 1e-6)
+    np.save(folder / "events_xy.npy", np.stack([events["x"], events["y"]], 1))
+    np.save(folder / "events_p.npy", events["p"] > 0)
+
+
+def write_npz_window(folder, events, name="0.npz"):
+    (folder / "events").mkdir(exist_ok=True)
+    columns = {key: events[key] for key in "txyp"}
+    np.savez(folder / "events" / name, **columns, time_unit="us")
+
+
+@pytest.mark.parametrize("write", [write_evreal, write_npz_window])
+def test_a_folder_that_is_written_anew_is_read_anew(tmp_path, events, write):
+    """Longer, as long but with other times, and much shorter."""
+    later = events.copy()
+    later["t"] += 1_000_000
+    for part in (events[:500], events, later, events[:10]):
+        write(tmp_path, part)
+        assert np.array_equal(quiet_read(tmp_path), part)
+
+
+def test_a_folder_that_grows_is_read_to_its_end(tmp_path, events):
+    for number, part in enumerate(np.array_split(events, 3)):
+        write_npz_window(tmp_path, part, f"{number}.npz")
+        assert len(quiet_read(tmp_path)) >= (number + 1) * (len(events) // 3)
+
+
+def write_windows(path, names, parts, sizes=()):
     with h5py.File(path, "w") as file:
-        for name, part in zip(names, parts, strict=True):
+        for number, (name, part) in enumerate(zip(names, parts, strict=True)):
             for column in "txyp":
                 file[f"{name}/{column}"] = part[column]
+            if sizes:
+                file[name].attrs["size"] = sizes[number]
+
+
+def read_as_one(path, count: int, **options) -> np.ndarray:
+    """Return the events of `count` windows; a warning other than that they are is an error."""
+    with pytest.warns(UserWarning) as told:
+        found = read_events(path, options=ReadOptions(**options))
+    line = f"{path}: {count} event streams, one after the other, are read as one (stream= chooses"
+    assert len(told) == 1 and str(told[0].message).startswith(line)
+    return found
 
 
 def test_numbered_windows_are_one_recording(tmp_path, events):
     parts = np.array_split(events, 12)
     parts.insert(5, events[:0])
     write_windows(tmp_path / "a.h5", [f"events/{n}" for n in range(13)], parts)
-    assert np.array_equal(quiet_read(tmp_path / "a.h5"), events)
+    assert np.array_equal(read_as_one(tmp_path / "a.h5", 13), events)
     with h5py.File(tmp_path / "b.h5", "w") as file:
         for number, part in enumerate(np.array_split(events, 3)):
             file[f"event_{number:06d}"] = np.stack([part[n].astype(np.int64) for n in "txyp"], 1)
-    assert np.array_equal(quiet_read(tmp_path / "b.h5"), events)
+    assert np.array_equal(read_as_one(tmp_path / "b.h5", 3), events)
 
 
 def test_windows_of_tables_have_the_columns_that_are_stated(tmp_path, events):
@@ -151,14 +190,52 @@ def test_windows_of_tables_have_the_columns_that_are_stated(tmp_path, events):
             file[f"event_{number}"] = ones
     with pytest.raises(ValueError, match="columns must say the order"):
         read_events(tmp_path / "a.h5")
-    found = read_events(tmp_path / "a.h5", options=ReadOptions(columns="pxyt", time_unit="us"))
+    found = read_as_one(tmp_path / "a.h5", 3, columns="pxyt", time_unit="us")
     assert np.array_equal(found["t"], early["t"]) and np.array_equal(found["x"], early["x"])
+
+
+@pytest.mark.parametrize("few", [[], [[9, 1, 0, 1]], [[9, 5, 4, 1], [9, 8, 3, -1]]])
+def test_all_windows_tell_the_order_of_columns(tmp_path, events, few):
+    """Of one event each column can be time; of events at one moment x can, where it ascends."""
+    rows = np.stack([events[name].astype(int) for name in "txyp"], 1)
+    first = np.array(few, int).reshape(-1, 4)
+    parts = [first, *np.array_split(rows, 3), first + np.array([400_000, 0, 0, 0])]
+    (tmp_path / "events").mkdir()
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for number, part in enumerate(parts):
+            file[f"events/{number}"] = part
+            np.savez(tmp_path / "events" / f"{number}.npz", part)
+    wanted = np.concatenate(parts)
+    in_folder = quiet_read(tmp_path, time_unit="us")
+    for found in (in_folder, read_as_one(tmp_path / "a.h5", len(parts), time_unit="us")):
+        assert all(np.array_equal(found[name], wanted[:, k]) for k, name in enumerate("txy"))
+
+
+def test_hidden_files_are_no_windows(tmp_path, events):
+    write_npz_window(tmp_path, events)
+    for name in ("._0.npz", ".partial.npz"):
+        (tmp_path / "events" / name).write_bytes(b"PK")
+    assert np.array_equal(quiet_read(tmp_path), events)
 
 
 def test_cameras_with_numbers_are_several_recordings(tmp_path, events):
     write_windows(tmp_path / "a.h5", ["camera0", "camera1"], [events, events[::2]])
     with pytest.warns(UserWarning, match="camera1"):
         assert np.array_equal(read_events(tmp_path / "a.h5"), events)
+
+
+@pytest.mark.parametrize(
+    ("name", "sizes"),
+    [("cam", ()), ("Camera_", ()), ("rig/view", ()), ("events", ((320, 240), (640, 480)))],
+)
+@pytest.mark.parametrize("first", [0, 1500])
+def test_cameras_one_after_the_other_are_several_recordings(tmp_path, events, name, sizes, first):
+    later = events.copy()
+    later["t"] += 1_000_000
+    parts = [events[:first], later]
+    write_windows(tmp_path / "a.h5", [f"{name}0", f"{name}1"], parts, sizes)
+    with pytest.warns(UserWarning, match=f"holds 2 event streams, 0 .*{name}0.*; read is 0"):
+        assert np.array_equal(read_events(tmp_path / "a.h5"), parts[0])
 
 
 def test_an_offset_beside_seconds_leaves_them_seconds(tmp_path, events):

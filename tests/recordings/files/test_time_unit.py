@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from src.recordings.files.clocks import TimestampUnwrapper
 from src.recordings.files.time_unit import TimeSample, check_times, find_unit, to_us
 
 DATE_S = 1_600_000_000
@@ -145,6 +146,21 @@ def test_a_counter_that_goes_round_is_seen(bits, duration, pieces):
     sample = sampled(t % 2**bits, pieces)
     assert sample.wrap_bits == bits and find_unit(sample, "auto") == ("us", "")
     assert sample.early_time_and_span()[1] == pytest.approx(duration * 1e6, rel=0.01)
+
+
+@pytest.mark.parametrize(("bits", "duration"), [(24, 40.0), (31, 0.5), (32, 0.5)])
+@pytest.mark.parametrize("pieces", [1, 7])
+def test_a_counter_whose_events_are_out_of_order_goes_round_once(bits, duration, pieces):
+    t = in_unit(made_up(duration, 1e5), "us", 0, int) + 2**bits - 200_000
+    t += np.random.default_rng(0).integers(-1000, 1000, len(t))
+    sample, clock = sampled(t % 2**bits, pieces), TimestampUnwrapper(bits)
+    found = [clock.unwrap(part) for part in np.array_split(t % 2**bits, pieces)]
+    assert sample.wrap_bits == bits and np.array_equal(np.concatenate(found), t)
+
+
+def test_a_long_silence_after_a_counter_went_round_is_kept():
+    t = 2**32 + np.array([-5, 3, 40 * 60 * 1_000_000, 2**32 - 10, 2**32 + 4, 2**32 - 2])
+    assert np.array_equal(TimestampUnwrapper().unwrap(t % 2**32), t)
 
 
 def test_a_single_wild_time_and_a_restart_are_no_counter_that_goes_round():
