@@ -124,8 +124,8 @@ def simulate_scene(cfg: DictConfig) -> dict:
     seen = views[:, step::step].numpy(), tilt[:, step::step].numpy(), counts
     clean = crop_frames(draw.clip.frames, draw.crop)[::step]
     print(describe_clip(cfg, drawn, clean.shape, draw.clip.fps / step))
-    seen, window_s = (*seen, pipeline.optics), step / draw.clip.fps
-    written = samples.write_light_field_panels(run, clean[1:].numpy(), *seen, window_s)
+    how = pipeline.optics, step / draw.clip.fps
+    written = samples.write_light_field_panels(run, clean[1:].numpy(), *seen, *how)
     if camera is None:
         print(f"written: {', '.join(map(str, written))}")
         return drawn

@@ -66,8 +66,7 @@ def draw_comparison(
 
 def find_ends(axis: str, line: Float[np.ndarray, "k 2"], places: int) -> tuple[float, float]:
     """Return where a slice of so many `places` along `line` begins and ends, half a place before
-    the first and after the last: x or y of the frame or r from the first, pixels, or theta, degrees.
-    """
+    the first and after the last: x, y, or r from the first, in pixels, or theta in degrees."""
     if axis == "theta":
         first, step = 0.0, 360 / places
     else:

@@ -50,9 +50,9 @@ def measure_static_scene(
     film: Float[np.ndarray, "frames h w"], line_spacing_px: int
 ) -> dict[str, float]:
     """Return `residual_displacement_px` of a static scene, the median over rows and columns
-    `line_spacing_px` apart and as far from the border that show it, nan where none does, `contrast`, the standard deviation of a
-    frame, and `flicker`, the mean change of a pixel from frame to frame over the contrast: nan of
-    a blank film.
+    `line_spacing_px` apart and as far from the border (nan where none shows the scene), `contrast`,
+    the standard deviation of a frame, and `flicker`, the mean change of a pixel from frame to frame
+    over the contrast: nan of a blank film.
 
     Raises ValueError where there is no such row or column.
     """

@@ -101,7 +101,9 @@ def test_a_comparison_ends_with_its_slices_or_with_notes_where_there_are_some(tm
 
 def test_times_and_places_of_a_comparison_are_those_of_the_frames(tmp_path, monkeypatch):
     drawn = []
-    monkeypatch.setattr("src.figures.comparison.save_figure", lambda figure, _: drawn.append(figure))
+    monkeypatch.setattr(
+        "src.figures.comparison.save_figure", lambda figure, _: drawn.append(figure)
+    )
     video = np.zeros((3, 100, 160))
     points = line_points((40, 64), (120, 64))
     rows = [VideoRow("a", video, video[:, 64, 40:121])]

@@ -75,7 +75,8 @@ def test_grey_panels_are_interpolated_and_events_are_not():
 def test_a_title_too_long_for_its_panel_ends_before_the_colon():
     title = title_events(1 / 120)
     narrow, short = (
-        join_panels({name: ramp(1, 160, 130)})[0, :TITLE_PX] for name in (title, "events of 8.33 ms")
+        join_panels({name: ramp(1, 160, 130)})[0, :TITLE_PX]
+        for name in (title, "events of 8.33 ms")
     )
     wide = join_panels({title: ramp(1, 160, 400)})[0, :TITLE_PX]
     assert np.array_equal(narrow, short) and (wide[:, 120:] < 0.5).any()
