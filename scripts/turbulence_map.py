@@ -29,7 +29,7 @@ ATMOSPHERE = "turbulence.atmosphere"
 PALE = 1.8  # times the largest value are the ends of the colours: text is read on all cells
 KEY = """half length of the tilt, px
 
-purple: nine views are better, orange: worse, *: 95 % CI without zero; grey: number of views"""
+purple: nine views are better, orange: worse, *: 95 % CI without zero; grey: fewest views"""
 Setting = tuple[float, float]  # half length of the tilt, its spread, px
 RunsBySetting = dict[Setting, dict[str, Run]]
 Cells = dict[Setting, tuple[float, str]]  # value, text
@@ -113,14 +113,14 @@ def _draw_panel(
 ) -> None:
     """Draw a panel whose colours end at `end`."""
     better = {metric.name: metric.better for metric in METRICS}.get(panel.metric, 1)
-    colours, low = ("PuOr", -end) if panel.metric else ("Greys", 0)
+    colours, low, high = ("PuOr", -end, end) if panel.metric else ("Greys", 0, 2 * end)
     values = np.full((len(spreads), len(halves)), np.nan)
     for (half, spread), (value, text) in panel.cells.items():
         column, row = halves.index(half), spreads.index(spread)
         values[row, column] = better * value
         axes.text(column, row, text, ha="center", va="center", fontsize=8)
     axes.patch.set(facecolor="white", hatch="////", edgecolor="0.7")
-    axes.imshow(values, colours, vmin=low, vmax=end, origin="lower", aspect="auto")
+    axes.imshow(values, colours, vmin=low, vmax=high, origin="lower", aspect="auto")
     axes.set_xticks(range(len(halves)), [f"{half:g}" for half in halves])
     axes.set_yticks(range(len(spreads)), [f"{spread:g}" for spread in spreads])
     axes.set_title(panel.title, fontsize=9)
@@ -143,7 +143,7 @@ def main() -> None:
         Panel(title, compute_differences(grouped, *chosen), chosen[2])
         for title, chosen in nine_less_one.items()
     ]
-    title = f"SetNet: fewest views with LPIPS at most {LPIPS_TOLERANCE} above nine"
+    title = f"SetNet: views within {LPIPS_TOLERANCE} LPIPS of nine"
     panels.append(Panel(title, count_views_needed(grouped)))
     print(draw_maps(given.out, [panel for panel in panels if panel.cells]))
 
