@@ -145,14 +145,19 @@ def _format_with_unit(result: StressResult) -> str:
 
 
 def format_value(value: float, limit: float) -> str:
-    """Return `value` to two digits or so, and more where it would read as the other number that it
-    stands beside, the `limit`."""
+    """Return `value` to two digits or so, and more where it would read as the `limit`, beside which
+    it stands, or as on the other side of it."""
     if not math.isfinite(value):
         return "∞" if value > 0 else "–"
     if value in (0, limit):
         return _format_digits(value, 0)
-    texts = (_format_digits(value, more) for more in range(16))
-    return next((text for text in texts if float(text) != float(f"{limit:g}")), f"{value:g}")
+    texts = (_format_digits(value, more) for more in range(20))
+    return next(text for text in texts if _compare(float(text), limit) == _compare(value, limit))
+
+
+def _compare(value: float, limit: float) -> int:
+    """Return -1 below the limit, 0 at it and 1 above."""
+    return (value > limit) - (value < limit)
 
 
 def _format_digits(value: float, more: int) -> str:
