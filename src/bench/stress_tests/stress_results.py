@@ -152,12 +152,8 @@ def format_value(value: float, limit: float) -> str:
     if value in (0, limit):
         return _format_digits(value, 0)
     texts = (_format_digits(value, more) for more in range(20))
-    return next(text for text in texts if _compare(float(text), limit) == _compare(value, limit))
-
-
-def _compare(value: float, limit: float) -> int:
-    """Return -1 below the limit, 0 at it and 1 above."""
-    return (value > limit) - (value < limit)
+    side = np.sign(value - limit)
+    return next(text for text in texts if np.sign(float(text) - limit) == side)
 
 
 def _format_digits(value: float, more: int) -> str:
