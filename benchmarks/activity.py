@@ -2,7 +2,7 @@
 
 One line for each network and size: milliseconds, the median of some windows, with events in 0, 5,
 10, 25, 50, 75 and 100 % of the tiles of 32 x 32 pixels, a block around the middle, 300 events a
-window in each.  `--figure FILE` draws them.
+window in each, over all views.  `--figure FILE` draws them.
 """
 
 import argparse
@@ -21,7 +21,7 @@ from src.figures import plots
 from src.models import load
 from src.sim.optics import layout
 
-TILE_PX, EVENTS = 32, 300  # side of a tile, events in each
+TILE_PX, EVENTS = 32, 300  # side of a tile, events in each over all views
 SIZES = ((9, 176, 176, 600.0), (1, 480, 640, 120.0), (1, 720, 1280, 120.0))  # views, h, w, rate
 SHARES = (0.0, 0.05, 0.1, 0.25, 0.5, 0.75, 1.0)
 
@@ -45,6 +45,12 @@ def windows(share: float, views: int, height: int, width: int, fps: float, count
         p, view = 2 * rng.integers(0, 2, n) - 1, rng.integers(0, views, n)
         made.append((np.sort(rng.uniform(*edges, n)), x, y, p, view, *edges))
     return made
+
+
+def describe_size(views: int, height: int, width: int, fps: float) -> str:
+    """Return the title of a size: the views, the rate, and the events of a window at 100 %."""
+    most = EVENTS * len(block(1.0, height, width))
+    return f"{views} x {width} x {height}, {fps:.0f} windows/s\n{most:,} events a window at 100 %"
 
 
 def draw(path: Path, measured: dict[tuple[str, str], list[float]]) -> None:
@@ -84,8 +90,8 @@ def main() -> None:
                 played = windows(share, views, height, width, fps, given.windows)
                 times = milliseconds(live.step, played, given.seconds, time.perf_counter)
                 found.append(statistics.median(times))
-            size = f"{views} x {width} x {height}"
-            print(f"{name}, {size} at {fps:.0f}/s:", *(f"{ms:7.2f}" for ms in found), flush=True)
+            size = describe_size(views, height, width, fps)
+            print(f"{name}, {size.splitlines()[0]}:", *(f"{ms:7.2f}" for ms in found), flush=True)
             measured[name, size] = found
     if given.figure:
         draw(given.figure, measured)

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from src.app.script import run_script
 from src.figures.plots import MARKERS, save_figure
-from src.metrics.table import METRICS
+from src.metrics.table import ARROWS, METRICS
 
 Curve = Sequence[Mapping[str, float]]
 
@@ -44,7 +44,7 @@ def draw_curves(path: Path, curves: Mapping[str, Curve]) -> Path:
             scored = [row for row in rows if metric.name in row]
             hours, values = ([row[key] for row in scored] for key in ("hours", metric.name))
             axes.plot(hours, values, marker=marker, markersize=3, linewidth=1.2, label=name)
-        axes.set_title(metric.title, fontsize=10)
+        axes.set_title(metric.heading_with_unit + ARROWS[metric.better], fontsize=10)
         axes.grid(alpha=0.3)
     figure.supxlabel("hours of training", fontsize=9)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside right center", fontsize=8)

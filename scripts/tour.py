@@ -41,6 +41,11 @@ def save(name: str, panels: dict[str, np.ndarray], scale: int = 2) -> None:
     print(f"{path}: {path.stat().st_size // 1000} kB")
 
 
+def outline(picture: np.ndarray) -> np.ndarray:
+    """Return a picture (h, w, 3) with a grey border: white ones side by side are told apart."""
+    return np.pad(picture[1:-1, 1:-1], ((1, 1), (1, 1), (0, 0)), constant_values=0.6)
+
+
 def stars(pipeline: Pipeline, draw: ClipParameters) -> np.ndarray:
     """Return what two neighbouring views make of a grid of points: the PSF of each place, moved by
     the tilt there."""
@@ -95,7 +100,7 @@ def draw_all(index: int) -> None:
         dict(zip(("events of the centre view", "of its neighbour"), events, strict=True)),
     )
     bins = render_events(voxels[centre].numpy(), full=1.5)
-    save("7_voxels", {f"bin {k}": part[32:160, 32:160] for k, part in enumerate(bins)})
+    save("7_voxels", {f"bin {k}": outline(part[32:160, 32:160]) for k, part in enumerate(bins)})
     last = {"ground truth": colours(truth[-1])}
     save("8_one_view", {"one view, reconstructed": colours(one[-1])} | last)
     save("9_nine_views", {"nine views, reconstructed": colours(nine[-1])} | last)

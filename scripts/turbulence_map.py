@@ -6,15 +6,18 @@ PSNR, and how many views SetNet needs.  [--out FILE]
 
 import argparse
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from src.app.script import run_script
 from src.figures.plots import save_figure
 from src.metrics.bootstrap import bootstrap_difference_interval
+from src.metrics.table import METRICS
 from src.records import runs
 from src.records.results import list_sources
 from src.records.runs import Run
@@ -24,9 +27,21 @@ SETNET = {1: "setnet_one", 3: "setnet_three", 5: "setnet_five", 9: "setnet_nine"
 LPIPS_TOLERANCE = 0.005  # above that of nine views
 ATMOSPHERE = "turbulence.atmosphere"
 PALE = 1.8  # times the largest value are the ends of the colours: text is read on all cells
+KEY = """half length of the tilt, px
+
+purple: nine views are better, orange: worse, *: 95 % CI without zero; grey: fewest views"""
 Setting = tuple[float, float]  # half length of the tilt, its spread, px
 RunsBySetting = dict[Setting, dict[str, Run]]
 Cells = dict[Setting, tuple[float, str]]  # value, text
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Cells under a title: differences of `metric`, or, without one, numbers of views."""
+
+    title: str
+    cells: Cells
+    metric: str = ""
 
 
 def group_runs(found: Sequence[Run]) -> RunsBySetting:
@@ -56,7 +71,7 @@ def compute_differences(
             sides = [[[float(clip[metric]) for clip in clips] for clips in side] for side in pooled]
             value = sum(sides[0][0]) / len(sides[0][0]) - sum(sides[1][0]) / len(sides[1][0])
             low, high = bootstrap_difference_interval(*sides, groups=list_sources(pooled[0][0]))
-            cells[setting] = (value, f"{value:+.{digits}f}" + ("*" if low * high > 0 else ""))
+            cells[setting] = (value, f"{value:+z.{digits}f}" + ("*" if low * high > 0 else ""))
     return cells
 
 
@@ -71,33 +86,44 @@ def count_views_needed(grouped: RunsBySetting) -> Cells:
     return cells
 
 
-def draw_maps(path: Path, maps: Mapping[str, Cells]) -> Path:
-    """Draw a panel for each of `maps`, two side by side, purple below zero and orange above; cells
-    without a value are grey.
+def draw_maps(path: Path, panels: Sequence[Panel]) -> Path:
+    """Draw the panels, two side by side: purple where more views are better, orange where they are
+    worse, those of one metric on one scale; numbers of views in grey.  Cells without a value are
+    hatched.
     """
-    settings = {setting for cells in maps.values() for setting in cells}
+    settings = {setting for panel in panels for setting in panel.cells}
     halves, spreads = (sorted({setting[axis] for setting in settings}) for axis in (0, 1))
-    rows = math.ceil(len(maps) / 2)
-    size = 0.6 + 1.5 * len(halves), 0.5 + (0.7 + 0.4 * len(spreads)) * rows
+    rows = math.ceil(len(panels) / 2)
+    size = 0.6 + 1.5 * len(halves), 0.8 + (0.7 + 0.4 * len(spreads)) * rows
     figure = Figure(figsize=size, layout="constrained")
-    panels = figure.subplots(rows, 2, squeeze=False).flatten()
-    for axes in panels[len(maps) :]:
+    places = figure.subplots(rows, 2, squeeze=False).flatten()
+    for axes in places[len(panels) :]:
         axes.set_axis_off()
-    for axes, (title, cells) in zip(panels, maps.items(), strict=False):
-        values = np.full((len(spreads), len(halves)), np.nan)
-        for (half, spread), (value, text) in cells.items():
-            column, row = halves.index(half), spreads.index(spread)
-            values[row, column] = value
-            axes.text(column, row, text, ha="center", va="center", fontsize=8)
-        most = PALE * max(float(np.nanmax(np.abs(values))), 1e-9)
-        axes.set_facecolor("#dddddd")
-        axes.imshow(values, "PuOr_r", vmin=-most, vmax=most, origin="lower", aspect="auto")
-        axes.set_xticks(range(len(halves)), [f"{half:g}" for half in halves])
-        axes.set_yticks(range(len(spreads)), [f"{spread:g}" for spread in spreads])
-        axes.set_title(title, fontsize=9)
-    figure.supxlabel("half length of the tilt, px", fontsize=9)
+    for axes, panel in zip(places, panels, strict=False):
+        alike = [one.cells for one in panels if one.metric == panel.metric]
+        most = max(abs(value) for cells in alike for value, _ in cells.values())
+        _draw_panel(axes, panel, halves, spreads, PALE * max(most, 1e-9))
+    figure.supxlabel(KEY, fontsize=9)
     figure.supylabel("tilt and blur, px", fontsize=9)
     return save_figure(figure, path)
+
+
+def _draw_panel(
+    axes: Axes, panel: Panel, halves: list[float], spreads: list[float], end: float
+) -> None:
+    """Draw a panel whose colours end at `end`."""
+    better = {metric.name: metric.better for metric in METRICS}.get(panel.metric, 1)
+    colours, low, high = ("PuOr", -end, end) if panel.metric else ("Greys", 0, 2 * end)
+    values = np.full((len(spreads), len(halves)), np.nan)
+    for (half, spread), (value, text) in panel.cells.items():
+        column, row = halves.index(half), spreads.index(spread)
+        values[row, column] = better * value
+        axes.text(column, row, text, ha="center", va="center", fontsize=8)
+    axes.patch.set(facecolor="white", hatch="////", edgecolor="0.7")
+    axes.imshow(values, colours, vmin=low, vmax=high, origin="lower", aspect="auto")
+    axes.set_xticks(range(len(halves)), [f"{half:g}" for half in halves])
+    axes.set_yticks(range(len(spreads)), [f"{spread:g}" for spread in spreads])
+    axes.set_title(panel.title, fontsize=9)
 
 
 def main() -> None:
@@ -108,13 +134,18 @@ def main() -> None:
     given = parser.parse_args()
     grouped = group_runs(runs.find_runs(given.folders))
     lf, setnet = ("lf3x3", "single256"), (SETNET[9], SETNET[1])
-    maps = {
-        "E2VID, Δ (9 − 1 views): LPIPS": compute_differences(grouped, *lf, "lpips", 3),
-        "the same: aligned PSNR, dB": compute_differences(grouped, *lf, "psnr_aligned", 2),
-        "SetNet, Δ (9 − 1 views): LPIPS": compute_differences(grouped, *setnet, "lpips", 3),
-        "views needed": count_views_needed(grouped),
+    nine_less_one = {
+        "E2VID, Δ (9 − 1 views): LPIPS": (*lf, "lpips", 3),
+        "E2VID, Δ (9 − 1 views): aligned PSNR, dB": (*lf, "psnr_aligned", 2),
+        "SetNet, Δ (9 − 1 views): LPIPS": (*setnet, "lpips", 3),
     }
-    print(draw_maps(given.out, {title: cells for title, cells in maps.items() if cells}))
+    panels = [
+        Panel(title, compute_differences(grouped, *chosen), chosen[2])
+        for title, chosen in nine_less_one.items()
+    ]
+    title = f"SetNet: views within {LPIPS_TOLERANCE} LPIPS of nine"
+    panels.append(Panel(title, count_views_needed(grouped)))
+    print(draw_maps(given.out, [panel for panel in panels if panel.cells]))
 
 
 if __name__ == "__main__":

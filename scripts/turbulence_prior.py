@@ -24,8 +24,8 @@ from src.records import safe_yaml
 from src.sim.turbulence import Atmosphere, sample_atmosphere
 
 COUNT, WIDTH = 400, 256
-COLOURS = {
-    "weak": "tab:green", "medium": "tab:orange", "strong": "tab:red", "extreme": "tab:purple"
+COLOURS = {  # ever darker
+    "weak": "#f0b429", "medium": "#d1571b", "strong": "#1f5fa8", "extreme": "#2d1e5f"
 }  # fmt: skip
 FARTHEST = 2000.0  # px; what is longer is drawn there
 COLUMNS = {
@@ -75,7 +75,7 @@ def plot_prior(
     found: Mapping[str, Sequence[Atmosphere]], measured: Sequence[Path], path: Path
 ) -> None:
     """Draw rms tilt against half length: draws as dots, footage as crosses with intervals."""
-    figure = Figure(figsize=(7, 5), layout="constrained")
+    figure = Figure(figsize=(8.4, 5), layout="constrained")
     axes = figure.subplots()
     for name in ("weak", "medium", "strong"):
         x = [min(each.tilt_correlation_half_length_px(WIDTH), FARTHEST) for each in found[name]]
@@ -99,7 +99,7 @@ def plot_prior(
     axes.set(xscale="log", yscale="log", xlabel="half length of the tilt, px of a frame 256 wide",
              ylabel="rms tilt per axis, px")  # fmt: skip
     axes.grid(alpha=0.3)
-    axes.legend(fontsize=8, loc="lower right")
+    figure.legend(fontsize=8, loc="outside right upper")
     save_figure(figure, path)
 
 

@@ -23,15 +23,15 @@ FORMS: dict[str, list] = {
 LARGEST_NUMBER = 1e5  # of a slice: pixels, turns a second, degrees
 MOST_SHOWN = 100
 NOTES = {
-    "residual_displacement_px": "residual displacement, static: {:.2f} px",
-    "line_deviation_px": "deviation from a line, moving: {:.2f} px",
-    "contrast": "contrast: {:.3f}",
-    "flicker": "change from frame to frame: {:.3f} of the contrast",
-    "ssim": "SSIM with the camera: {:.3f}",
-    "lpips": "LPIPS: {:.3f}",
-    "lpips_aligned": "LPIPS, brightness and contrast aligned: {:.3f}",
-    "correlation": "correlation: {:.3f}",
-}
+    "residual_displacement_px": ("residual displacement, if static: ", ".2f", " px"),
+    "line_deviation_px": ("deviation from a line, if moving: ", ".2f", " px"),
+    "contrast": ("contrast: ", ".3f", ""),
+    "flicker": ("change from frame to frame: ", ".3f", " of the contrast"),
+    "ssim": ("SSIM with the camera: ", ".3f", ""),
+    "lpips": ("LPIPS: ", ".3f", ""),
+    "lpips_aligned": ("LPIPS, brightness and contrast aligned: ", ".3f", ""),
+    "correlation": ("correlation: ", ".3f", ""),
+}  # text, format of the value, unit
 
 
 def compare(cfg: DictConfig) -> dict:
@@ -130,7 +130,12 @@ def _score_against_camera(cfg: DictConfig, video: Path, frames: int) -> dict:
 
 
 def _format_note(scores: dict) -> str:
-    return "\n".join(NOTES[measure].format(value) for measure, value in scores.items())
+    """Return a line for each measure; a dash for one that the videos do not show."""
+    lines = []
+    for measure, value in scores.items():
+        text, form, unit = NOTES[measure]
+        lines.append(text + ("-" if math.isnan(value) else f"{value:{form}}{unit}"))
+    return "\n".join(lines)
 
 
 def _draw(
@@ -139,7 +144,7 @@ def _draw(
 ) -> None:  # fmt: skip
     comparison.draw_comparison(
         rows, path, line=line, axis=slices.name_axis(kind, line), samples=cfg.frames_shown,
-        length_s=min(len(row.video) for row in rows) / cfg.fps,
+        frame_s=1 / cfg.fps,
     )  # fmt: skip
 
 

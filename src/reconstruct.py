@@ -209,7 +209,8 @@ def join_film_panels(
     """
     for window, *shown in zip(windows, *methods.values(), strict=False):
         assert window.voxels is not None
-        panels = {samples.EVENTS_TITLE: samples.render_events(window.voxels[0], full=1.0)}
+        title = samples.title_events(window.length_s)
+        panels = {title: samples.render_events(window.voxels[0], full=1.0)}
         panels |= {name: one.picture[None] for name, one in zip(methods, shown, strict=True)}
         if clean is not None:
             size = shown[-1].picture.shape

@@ -102,7 +102,8 @@ def draw_user_clip(
     counts = work.sensor.voxels(light, work.simulated_fps, 1, substeps=work.substeps)[
         0, :, :, 0
     ].numpy()
-    return samples.write_light_field_panels(run, clean, seen, tilt, counts, work.optics)
+    shown_s = 1 / work.clip.fps
+    return samples.write_light_field_panels(run, clean, seen, tilt, counts, work.optics, shown_s)
 
 
 def simulate_scene(cfg: DictConfig) -> dict:
@@ -123,7 +124,8 @@ def simulate_scene(cfg: DictConfig) -> dict:
     seen = views[:, step::step].numpy(), tilt[:, step::step].numpy(), counts
     clean = crop_frames(draw.clip.frames, draw.crop)[::step]
     print(describe_clip(cfg, drawn, clean.shape, draw.clip.fps / step))
-    written = samples.write_light_field_panels(run, clean[1:].numpy(), *seen, pipeline.optics)
+    how = pipeline.optics, step / draw.clip.fps
+    written = samples.write_light_field_panels(run, clean[1:].numpy(), *seen, *how)
     if camera is None:
         print(f"written: {', '.join(map(str, written))}")
         return drawn

@@ -512,6 +512,19 @@ def test_of_videos_of_two_lengths_the_common_frames_are_compared(tmp_path, capsy
     assert "the first 4 of these frames of each are compared: a 9, b 4" in capsys.readouterr().out
 
 
+def test_a_measure_that_two_frames_do_not_show_is_a_dash(tmp_path, capsys):
+    (tmp_path / "film").mkdir()
+    y, x = np.mgrid[:20, :80]
+    for k in range(2):
+        picture = (200 * np.clip(4.5 - np.hypot(x - 30 - 9 * k, y - 10), 0, 1)).astype(np.uint8)
+        cv2.imwrite(str(tmp_path / f"film/{k}.png"), picture)
+    film = [f"videos=[{tmp_path}/film]", "line=[[0,10],[79,10]]"]
+    compare(config("compare", tmp_path / "run", *film))
+    said = capsys.readouterr().out
+    assert "residual displacement, if static: " in said and "nan" not in said
+    assert "deviation from a line, if moving: -\n" in said
+
+
 def test_videos_of_two_shapes_are_not_stretched(tmp_path):
     for name, size in (("wide", (20, 30)), ("high", (50, 10))):
         (tmp_path / name).mkdir()

@@ -160,9 +160,32 @@ def test_the_turbulence_map_shows_where_more_views_help(tmp_path):
     cells[7, 1]["lf3x3"].clips[0]["name"] = "another"
     with pytest.raises(ValueError, match="folders must hold the same clips, got 2 sets"):
         turbulence_map.compute_differences(cells, "lf3x3", "single256", "lpips", 2)
-    assert turbulence_map.draw_maps(
-        tmp_path / "map.png", {"a": margins, "b": turbulence_map.count_views_needed(cells)}
-    ).is_file()
+
+
+def test_maps_of_one_metric_have_one_scale_and_better_is_purple(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(turbulence_map, "save_figure", lambda figure, _: drawn.append(figure))
+    cells = [{(7, 1): (value, "")} for value in (-0.02, 0.2, -0.04, 3.0)]
+    metrics = ("lpips", "psnr_aligned", "lpips", "")
+    panels = [turbulence_map.Panel("a", *each) for each in zip(cells, metrics, strict=True)]
+    turbulence_map.draw_maps(tmp_path / "map.png", panels)
+    pictures = [axes.images[0] for axes in drawn[0].axes]
+    assert pictures[0].get_clim() == pictures[2].get_clim() == pytest.approx((-0.072, 0.072))
+    shades = [np.array(picture.to_rgba(picture.get_array())[0, 0]) for picture in pictures]
+    assert all(blue > red > green for red, green, blue, _ in shades[:3])
+    assert np.ptp(shades[3][:3]) < 0.01 and "purple: nine views" in turbulence_map.KEY
+
+
+def test_a_difference_that_rounds_to_zero_has_no_minus(tmp_path):
+    def run(name: str, psnr: float) -> Run:
+        settings = {turbulence_map.ATMOSPHERE + ".tilt_correlation_half_length_px": [7, 7]}
+        settings[turbulence_map.ATMOSPHERE + ".tilt_and_blur_px.strong"] = [1, 1]
+        record = {"experiment": name, "seed": 0}
+        return Run(tmp_path / name, record, settings, [{"name": "clip0", "psnr": str(psnr)}])
+
+    cells = turbulence_map.group_runs([run("lf3x3", 20.0), run("single256", 20.001)])
+    found = turbulence_map.compute_differences(cells, "lf3x3", "single256", "psnr", 2)
+    assert found[7, 1][1].startswith("+0.00")
 
 
 def test_what_lies_around_is_taught_while_the_memory_rests(tmp_path):

@@ -205,7 +205,7 @@ def draw_measured_turbulence(measured: TurbulenceMeasurement, title: str, path: 
     distance.set_xticks(DISTANCE_TICKS, map(str, DISTANCE_TICKS))
     distance.set(
         xlim=(-0.1, 1.45 * SIDE), ylim=(-0.3, 1.3), xlabel=f"distance, px of a frame of {SIDE}",
-        ylabel="correlation of the tilt", title="the excess at distance 0 is the tracking error",
+        ylabel="correlation of the tilt", title=describe_excess(tilt.correlation[0]),
     )  # fmt: skip
     distance.legend(loc="lower left")
 
@@ -220,6 +220,13 @@ def draw_measured_turbulence(measured: TurbulenceMeasurement, title: str, path: 
     lag.set(xlabel=unit, ylabel="correlation of the tilt", ylim=(-0.5, 1.05), title=text)
     figure.suptitle(title)
     return save_figure(figure, path)
+
+
+def describe_excess(correlation: float) -> str:
+    """Return the title for the correlation of points at distance 0, over the fit's, which is 1:
+    what it has more is the error of tracking; nothing where it is not more, or unknown."""
+    excess = correlation - 1
+    return f"tracking error: {excess:.2f} above the fit at distance 0" if excess > 0 else ""
 
 
 def _mark_estimate(axes: Axes, estimate: IntervalEstimate, name: str, unit: str) -> None:

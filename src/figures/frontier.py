@@ -17,7 +17,7 @@ from src.bench.speed_accuracy import ClipScore, find_fastest_forms, find_pareto_
 from src.figures.plots import save_figure
 from src.metrics.table import METRICS, Column, mean_score
 
-PAPER_MS, LIVE_MS = 3.4, 1000 / 600
+PAPER_MS, PAPER_SIDE, LIVE_MS = 3.4, 176, 1000 / 600  # the paper's frames are of 176 x 176
 DRAWN = tuple(metric for metric in METRICS if metric.name in ("lpips", "psnr_aligned"))
 SEVERAL_VIEWS, ONE_VIEW = "#1f5fa8", "#d1571b"
 MARKER_PX, CLEARANCE_PX, NAME_GAP_PT = 4, 1, 6  # half of a marker; around a name; to its point
@@ -33,17 +33,23 @@ def draw_accuracy_against_time(
 ) -> Path:  # fmt: skip
     """Draw the float32 scores of every network at the thread time of its fastest form on frames of
     `side`, with a line to its fastest time on more threads; the dashed line is the Pareto front.
+    The title ends with the number of clips; the paper's time is drawn at its own size.
     """
     timed = find_fastest_forms(speeds, side)
     metrics = [metric for metric in DRAWN if scores and metric.name in scores[0].values]
     figure = Figure(figsize=(14, 6))
     panels = figure.subplots(1, max(len(metrics), 1), squeeze=False)[0]
     pairs = list(zip(panels, metrics, strict=False))
+    marks = {LIVE_MS: "600 frames a second"}
+    marks |= {PAPER_MS: f"the paper: {PAPER_MS} ms"} if side == PAPER_SIDE else {}
+    for axes in panels[: len(metrics)]:
+        _mark_times(axes, marks)
     spans = [_draw_metric(axes, metric, timed, speeds, scores) for axes, metric in pairs]
     threads = sorted({s.threads for s in speeds if s.threads > 1})
     more = f"; lines: to {' and '.join(map(str, threads))} threads" if threads else ""
     figure.supxlabel(f"ms from events to a frame of {side}x{side}, one CPU thread{more}")
-    figure.suptitle(title)
+    clips = len({(score.severity, score.clip) for score in scores})
+    figure.suptitle(f"{title}, {clips} clip{'s' * (clips != 1)}")
     _draw_legend(figure, timed)
     figure.draw_without_rendering()  # places the panels, by which names keep their distance
     for axes, placed in zip(panels, spans, strict=False):
@@ -68,18 +74,8 @@ def _draw_metric(
     errors = {key: (ms, -metric.better * score) for key, (_, ms, score) in spans.items()}
     front = np.array([spans[key][1:] for key in find_pareto_front(errors)]).reshape(-1, 2)
     axes.plot(*front.T, color="0.35", ls="--", lw=1, zorder=0)
-    place: dict[str, Any] = {
-        "rotation": 90,
-        "fontsize": 7,
-        "color": "0.4",
-        "ha": "right",
-        "va": "top",
-    }
-    for ms, text in ((PAPER_MS, "the paper: 3.4 ms"), (LIVE_MS, "600 frames a second")):
-        axes.axvline(ms, color="0.6", lw=0.8, ls=":")
-        axes.text(ms, 0.985, f"{text} ", transform=axes.get_xaxis_transform(), **place)
     side = "higher" if metric.better > 0 else "lower"
-    axes.set_title(f"{metric.heading}  ({side} is better)")
+    axes.set_title(f"{metric.heading_with_unit}  ({side} is better)")
     axes.set_xscale("log")
     axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axes.xaxis.set_major_formatter("{x:g}")
@@ -87,6 +83,15 @@ def _draw_metric(
     axes.margins(0.12, 0.08)
     axes.grid(alpha=0.25)
     return spans
+
+
+def _mark_times(axes: Axes, marks: Mapping[float, str]) -> None:
+    """Draw a dotted line, with a text, at each time in ms."""
+    place: dict[str, Any] = {"rotation": 90, "fontsize": 7, "color": "0.4"}
+    place |= {"ha": "right", "va": "top", "transform": axes.get_xaxis_transform()}
+    for ms, text in marks.items():
+        axes.axvline(ms, color="0.6", lw=0.8, ls=":")
+        axes.text(ms, 0.985, f"{text} ", **place)
 
 
 def _is_like(one: SpeedMeasurement, other: SpeedMeasurement) -> bool:
@@ -106,11 +111,11 @@ def _draw_legend(figure: Figure, timed: Mapping[str, SpeedMeasurement]) -> None:
 
 
 def _name_points(axes: Axes, spans: Mapping[str, Span]) -> None:
-    """Write each name at the first place where it covers nothing and is nearest to its own point,
-    else where it covers and is near to the fewest others."""
+    """Write each name at the first place where it covers nothing, texts of `axes` included, and is
+    nearest to its own point, else where it covers and is near to the fewest others."""
     to_px = axes.transData.transform
     lines = [_box(to_px((least, score)), to_px((ms, score))) for least, ms, score in spans.values()]
-    taken = list(lines)
+    taken = lines + [text.get_window_extent() for text in axes.texts]
     for (name, span), own in zip(spans.items(), lines, strict=True):
         written = [_write(axes, name, span, place) for place in NAME_PLACES]
         boxes = [text.get_window_extent().padded(CLEARANCE_PX) for text in written]

@@ -23,7 +23,6 @@ GAP_PX = 4
 MAX_VIEW_PX = 160  # longest side of a view in views.gif
 WEBP_QUALITY = 70
 MIN_HEIGHT_PX = 160  # lower panels are enlarged by a whole factor
-EVENTS_TITLE = "events: brighter red, darker blue"
 
 Video = Float[np.ndarray, "_frames _h _w *_rgb"]
 
@@ -43,13 +42,15 @@ def write_samples(folder: Path, clips: Iterable[tuple[Sample, Tensor]]) -> list[
         positions = sample.positions or layout(sample.voxels.shape[2])
         centre = most_central_view_index(positions)
         counts = sample.voxels[0, :, centre].sum(1).cpu().numpy()
-        events = {EVENTS_TITLE: render_events(counts), "reconstruction": videos["reconstruction"]}
+        window_s = float(sample.window_s[0])
+        events = {title_events(window_s): render_events(counts)}
+        events["reconstruction"] = videos["reconstruction"]
         first = {name: videos[name] for name in ("clean", "centre view")}
         write_animation(gif, join_panels(first | events), PLAYBACK_FPS)
-        windows, height, width = videos["clean"].shape
+        _, height, width = videos["clean"].shape
         line = np.array([[0, height // 2], [width - 1, height // 2]], dtype=float)
         rows = [VideoRow(name, video, video[:, height // 2]) for name, video in videos.items()]
-        draw_comparison(rows, slices, line=line, length_s=(windows - 1) * float(sample.window_s[0]))
+        draw_comparison(rows, slices, line=line, frame_s=window_s)
         paths += [gif, slices]
     return paths
 
@@ -57,16 +58,17 @@ def write_samples(folder: Path, clips: Iterable[tuple[Sample, Tensor]]) -> list[
 def write_light_field_panels(
     folder: Path, clean: Video, views: Float[np.ndarray, "views windows h w"],
     tilt: Float[np.ndarray, "views windows 2 h w"],
-    counts: Float[np.ndarray, "views windows h w"], optics: Optics,
+    counts: Float[np.ndarray, "views windows h w"], optics: Optics, window_s: float,
 ) -> list[Path]:  # fmt: skip
     """Write `views.gif` and its last frame `views.png`: the clean clip, and of every view its
-    light, in [0, 1], its tilt and its sums of polarity, in the arrangement of the views; pictures
-    longer than MAX_VIEW_PX shrunk to that.
+    light, in [0, 1], its tilt and its sums of polarity over a window of `window_s` seconds, in the
+    arrangement of the views; pictures longer than MAX_VIEW_PX shrunk to that, sums to those of
+    largest magnitude.
 
     Of `tilt`, in pixels, that in x is drawn: red where the picture is pushed right, blue where
     left.  The clean clip is as high as all views together.
     """
-    views, tilt, counts = map(_shrink, (views, tilt, counts))
+    views, tilt, counts = _shrink(views), _shrink(tilt), shrink_events(counts)
     seen = place_views_at_apertures(list(views), optics)
     events = [render_events(part) for part in counts]
     reach = max(float(np.abs(tilt).max()), 1e-6)
@@ -75,7 +77,7 @@ def write_light_field_panels(
         "clean": resize_pictures(clean, seen.shape[1]),
         "views": seen,
         f"tilt in x, +-{reach:.1f} px": place_views_at_apertures(pushed, optics),
-        EVENTS_TITLE: place_views_at_apertures(events, optics),
+        title_events(window_s): place_views_at_apertures(events, optics),
     }
     frames = join_panels(panels)
     paths = [folder / "views.gif", folder / "views.png"]
@@ -92,6 +94,20 @@ def _shrink(pictures: Float[np.ndarray, "*n h w"]) -> Float[np.ndarray, "*n h2 w
         return pictures
     small = resize_pictures(pictures.reshape(-1, height, width), max(1, round(height * shrink)))
     return small.reshape(*shape, *small.shape[1:])
+
+
+def shrink_events(counts: Float[np.ndarray, "*n h w"]) -> Float[np.ndarray, "*n h2 w2"]:
+    """Return sums of polarity at most MAX_VIEW_PX long: of each area the one of largest magnitude,
+    as in a mean single events would fade."""
+    most = least = counts
+    shrink = MAX_VIEW_PX / max(counts.shape[-2:])
+    for axis in (-2, -1) if shrink < 1 else ():
+        length = counts.shape[axis]
+        small = max(1, round(length * shrink))
+        starts = np.arange(small) * length // small
+        most = np.maximum.reduceat(most, starts, axis)
+        least = np.minimum.reduceat(least, starts, axis)
+    return np.where(most >= -least, most, least)
 
 
 def resize_pictures(
@@ -115,6 +131,11 @@ def place_views_at_apertures(videos: list[Video], optics: Optics) -> Video:
         top, left = (row - min(rows)) * height, (column - min(columns)) * width
         canvas[:, top : top + height, left : left + width] = video
     return canvas
+
+
+def title_events(seconds: float) -> str:
+    """Return the title of a panel of the events of so many seconds."""
+    return f"events of {1e3 * seconds:.3g} ms: brighter red, darker blue"
 
 
 def render_events(

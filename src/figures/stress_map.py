@@ -84,4 +84,4 @@ def _draw_cell(axes, row: int, column: int, outcome: StressResult | str) -> None
     style: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": 9}
     style["color"] = "white" if shade > 0.85 or shade < 0.15 else "black"
     style["weight"] = "bold" if outcome.failed else "normal"
-    axes.text(column + 0.5, row + 0.5, format_value(outcome.value), **style)
+    axes.text(column + 0.5, row + 0.5, format_value(outcome.value, outcome.limit), **style)

@@ -50,9 +50,9 @@ def measure_static_scene(
     film: Float[np.ndarray, "frames h w"], line_spacing_px: int
 ) -> dict[str, float]:
     """Return `residual_displacement_px` of a static scene, the median over rows and columns
-    `line_spacing_px` apart and as far from the border, `contrast`, the standard deviation of a
-    frame, and `flicker`, the mean change of a pixel from frame to frame over the contrast: nan of
-    a blank film.
+    `line_spacing_px` apart and as far from the border (nan where none shows the scene), `contrast`,
+    the standard deviation of a frame, and `flicker`, the mean change of a pixel from frame to frame
+    over the contrast: nan of a blank film.
 
     Raises ValueError where there is no such row or column.
     """
@@ -64,8 +64,9 @@ def measure_static_scene(
     lines += [inside[:, :, x] for x in range(0, inside.shape[2], step)]
     contrast = float(film.std((1, 2)).mean())
     change = float(np.abs(np.diff(film, axis=0)).mean())
+    shown = [value for value in map(residual_displacement_px, lines) if np.isfinite(value)]
     return {
-        "residual_displacement_px": float(np.nanmedian([*map(residual_displacement_px, lines)])),
+        "residual_displacement_px": float(np.median(shown)) if shown else float("nan"),
         "contrast": contrast,
         "flicker": change / contrast if contrast > 0 else float("nan"),
     }

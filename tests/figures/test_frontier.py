@@ -1,8 +1,12 @@
 """Names in the chart of accuracy against time stand nearest to their own points."""
 
+import pytest
 from matplotlib.figure import Figure
 from matplotlib.text import Annotation
 
+from src.bench.speed import SpeedMeasurement
+from src.bench.speed_accuracy import ClipScore
+from src.figures import frontier
 from src.figures.frontier import _box, _gap, _name_points
 
 
@@ -30,3 +34,29 @@ def test_names_of_points_side_by_side_are_nearest_to_their_own():
         box = text.get_window_extent()
         nearest = min(lines, key=lambda name: _gap(box, lines[name]))
         assert nearest == text.get_text()
+
+
+@pytest.mark.parametrize("side", [64, 176])
+def test_the_papers_time_is_drawn_at_its_own_size_and_clips_are_counted(
+    tmp_path, monkeypatch, side
+):
+    drawn = []
+    monkeypatch.setattr(frontier, "save_figure", lambda figure, path: drawn.append(figure) or path)
+    speed = SpeedMeasurement("net", True, 9, side, "cpu", 1, "float32", ms=5.0)
+    scores = [ClipScore("net", s, k, {"psnr_aligned": 20.0}) for s in "ab" for k in range(2)]
+    frontier.draw_accuracy_against_time(tmp_path / "a.png", [speed], scores, side=side, title="t")
+    (axes,) = drawn[0].axes
+    written = " ".join(text.get_text() for text in axes.texts)
+    assert ("the paper" in written) == (side == 176) and "600 frames" in written
+    assert drawn[0].get_suptitle() == "t, 4 clips" and "aligned PSNR, dB" in axes.get_title()
+
+
+def test_a_name_does_not_cover_the_text_of_a_line():
+    figure = Figure(figsize=(7, 6))
+    axes = figure.subplots()
+    axes.set(xlim=(0, 10), ylim=(0, 10))
+    beside = axes.text(5.1, 5, "a long text", va="center")
+    figure.draw_without_rendering()
+    _name_points(axes, {"net": (5.0, 5.0, 5.0)})
+    name = next(text for text in axes.texts if isinstance(text, Annotation))
+    assert not name.get_window_extent().overlaps(beside.get_window_extent())

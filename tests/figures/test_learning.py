@@ -5,6 +5,7 @@ import os
 import pytest
 from PIL import Image
 
+from scripts import learning_curves
 from scripts.learning_curves import draw_curves, read_curve
 
 
@@ -19,6 +20,15 @@ def test_the_newest_curve_is_drawn(tmp_path):
     path = draw_curves(tmp_path / "a.png", {"lf": rows, "none yet": read_curve(tmp_path / "no")})
     with Image.open(path) as picture:
         assert picture.size[0] > picture.size[1]
+
+
+def test_a_panel_has_its_unit(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(learning_curves, "save_figure", lambda figure, _: drawn.append(figure))
+    line = {"hours": 0.0, "lpips": 0.5, "psnr": 20.0, "psnr_aligned": 21.0}
+    draw_curves(tmp_path / "a.png", {"a": [line]})
+    titles = [axes.get_title() for axes in drawn[0].axes]
+    assert titles == ["LPIPS ↓", "PSNR, dB ↑", "aligned PSNR, dB ↑"]
 
 
 def test_without_a_line_nothing_is_drawn(tmp_path):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from src.figures.comparison import VideoRow, draw_comparison
+from src.figures.comparison import VideoRow, draw_comparison, find_ends
 from src.figures.slices import (
     circle_points,
     line_points,
@@ -92,8 +92,38 @@ def test_a_comparison_ends_with_its_slices_or_with_notes_where_there_are_some(tm
     video = np.zeros((6, 40, 40))
     rows = [VideoRow(name, video, video[:, 20], note) for name in ("a", "b")]
     draw_comparison(
-        rows, tmp_path / "a.png", line=np.array([[0.0, 20.0], [39.0, 20.0]]), length_s=0.1
+        rows, tmp_path / "a.png", line=np.array([[0.0, 20.0], [39.0, 20.0]]), frame_s=0.02
     )
     shown = np.asarray(Image.open(tmp_path / "a.png").convert("L")) < 100
     end = np.flatnonzero(shown[shown.shape[0] // 4]).max() / shown.shape[1]
     assert end < 0.9 if note else end > 0.97
+
+
+def test_times_and_places_of_a_comparison_are_those_of_the_frames(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(
+        "src.figures.comparison.save_figure", lambda figure, _: drawn.append(figure)
+    )
+    video = np.zeros((3, 100, 160))
+    points = line_points((40, 64), (120, 64))
+    rows = [VideoRow("a", video, video[:, 64, 40:121])]
+    draw_comparison(rows, tmp_path / "a.png", line=points, frame_s=1 / 120, samples=2)
+    first, last, slice_panel = drawn[0].axes
+    assert [first.get_title(), last.get_title()] == ["0.0 ms", "16.7 ms"]
+    assert slice_panel.get_title() == "x-t, 25 ms"
+    assert slice_panel.images[0].get_extent() == pytest.approx([39.5, 120.5, 25, 0])
+    assert (slice_panel.get_xlabel(), slice_panel.get_ylabel()) == ("x, px", "t, ms")
+
+
+@pytest.mark.parametrize(
+    ("axis", "line", "ends"),
+    [
+        ("x", line_points((0, 12), (59, 12)), (-0.5, 59.5)),
+        ("x", line_points((59, 12), (0, 12)), (59.5, -0.5)),
+        ("y", line_points((7, 10), (7, 30)), (9.5, 30.5)),
+        ("r", line_points((10, 20), (40, 60)), (-0.5, 50.5)),
+        ("theta", circle_points((30, 20), 15, 90), (-2, 358)),
+    ],
+)
+def test_a_slice_begins_and_ends_half_a_place_beyond_its_points(axis, line, ends):
+    assert find_ends(axis, line, len(line)) == pytest.approx(ends)

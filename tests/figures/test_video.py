@@ -5,12 +5,13 @@ import pytest
 from PIL import Image, ImageSequence
 
 from src.figures.samples import (
-    EVENTS_TITLE,
     GAP_PX,
     TITLE_PX,
     join_panels,
     render_events,
     resize_pictures,
+    shrink_events,
+    title_events,
     write_animation,
 )
 
@@ -30,6 +31,15 @@ def test_events_are_red_where_brighter_and_blue_where_darker_on_white():
 def test_fainter_events_are_paler():
     one, two, three = render_events(np.array([[[1.0, 2.0, 3.0]]]))[0, 0, :, 2]
     assert 1 > one > two > three
+
+
+def test_single_events_of_a_large_view_are_as_dark_when_it_is_shrunk():
+    counts = np.zeros((2, 480, 640), np.float32)
+    counts[0, 100, 200], counts[0, 101, 201], counts[1, -1, -1] = 1, -2, 1
+    small = shrink_events(counts)
+    assert small.shape == (2, 120, 160)
+    assert small[0, 25, 50] == -2 and small[1, -1, -1] == 1 and np.count_nonzero(small) == 2
+    assert np.array_equal(shrink_events(counts[:, :100, :150]), counts[:, :100, :150])
 
 
 def test_panels_stand_side_by_side_under_their_names():
@@ -63,10 +73,12 @@ def test_grey_panels_are_interpolated_and_events_are_not():
 
 
 def test_a_title_too_long_for_its_panel_ends_before_the_colon():
+    title = title_events(1 / 120)
     narrow, short = (
-        join_panels({name: ramp(1, 160, 100)})[0, :TITLE_PX] for name in (EVENTS_TITLE, "events")
+        join_panels({name: ramp(1, 160, 130)})[0, :TITLE_PX]
+        for name in (title, "events of 8.33 ms")
     )
-    wide = join_panels({EVENTS_TITLE: ramp(1, 160, 300)})[0, :TITLE_PX]
+    wide = join_panels({title: ramp(1, 160, 400)})[0, :TITLE_PX]
     assert np.array_equal(narrow, short) and (wide[:, 120:] < 0.5).any()
 
 

@@ -1,5 +1,7 @@
 """Strayings of known size are found in slices."""
 
+import warnings
+
 import numpy as np
 import pytest
 
@@ -70,7 +72,14 @@ def test_a_slice_in_which_nothing_moves_has_no_straightness():
     assert np.isnan(slice_motion.uniform_rotation_deviation_px(np.full((10, 50), 0.5)))
 
 
-@pytest.mark.filterwarnings("ignore:All-NaN slice")
+def test_a_film_of_noise_shows_no_displacement_and_brings_no_warning():
+    noise = np.random.default_rng(0).random((20, 64, 64))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = slice_motion.measure_static_scene(noise, 8)
+    assert np.isnan(found["residual_displacement_px"]) and found["flicker"] > 1
+
+
 def test_a_blank_film_does_not_stand_still():
     blank = slice_motion.measure_static_scene(np.full((6, 40, 40), 0.5, np.float32), 8)
     assert np.isnan(blank["flicker"]) and np.isnan(blank["residual_displacement_px"])

@@ -125,7 +125,7 @@ def _summarize_network(outcomes: Mapping[str, Outcome]) -> str:
         elif outcome.failed:
             failed.append(f"- {title}: {_describe_failure(outcome)}")
         else:
-            passed.append(f"{title} ({format_value(outcome.value)} {outcome.unit})")
+            passed.append(f"{title} ({_format_with_unit(outcome)})")
     ran = len(failed) + len(passed)
     lines = [f"Fails {len(failed)} of the {ran} tests that ran.", *failed] if ran else []
     lines += ["", "Passes: " + "; ".join(passed) + "."] if passed else []
@@ -135,18 +135,32 @@ def _summarize_network(outcomes: Mapping[str, Outcome]) -> str:
 
 def _describe_failure(result: StressResult) -> str:
     side = "at least" if result.higher_is_better else "at most"
-    text = f"{format_value(result.value)} {result.unit}, limit {side} {result.limit:g}"
+    text = f"{_format_with_unit(result)}, limit {side} {result.limit:g}"
     where = result.first_failure
     return text if where is None else f"{text}; fails from {result.varied} = {where} on"
 
 
-def format_value(value: float) -> str:
-    """Return `value` to two digits or so."""
+def _format_with_unit(result: StressResult) -> str:
+    return f"{format_value(result.value, result.limit)} {result.unit}".rstrip()
+
+
+def format_value(value: float, limit: float) -> str:
+    """Return `value` to two digits or so, and more where it would read as the `limit`, beside which
+    it stands, or as on the other side of it."""
     if not math.isfinite(value):
         return "∞" if value > 0 else "–"
+    if value in (0, limit):
+        return _format_digits(value, 0)
+    texts = (_format_digits(value, more) for more in range(20))
+    side = np.sign(value - limit)
+    return next(text for text in texts if np.sign(float(text) - limit) == side)
+
+
+def _format_digits(value: float, more: int) -> str:
+    """Return a finite `value` to two digits or so, and so many more."""
     if value == 0:
         return "0"
     if abs(value) < 0.0095:
-        return f"{value:.0e}".replace("e-0", "e-")
+        return f"{value:.{more}e}".replace("e-0", "e-")
     digits = 0 if abs(value) >= 20 else 1 if abs(value) >= 1 else 2
-    return f"{value:.{digits}f}"
+    return f"{value:.{digits + more}f}"

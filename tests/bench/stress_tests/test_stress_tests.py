@@ -128,6 +128,34 @@ def test_nothing_known_is_a_failure_and_the_first_break_is_found():
     assert found.failed and found.first_failure == 2
 
 
+@pytest.mark.parametrize(
+    ("value", "limit", "text"),
+    [
+        (0.0204, 0.02, "0.0204"),
+        (2.03, 2.0, "2.03"),
+        (0.0041, 0.004, "4.1e-3"),
+        (2.0, 2.0, "2.0"),
+        (np.nextafter(0.02, 1), 0.02, "0.020000000000000004"),
+        (0.5, 0.02, "0.50"),
+        (0.0, 0.0, "0"),
+        (0.334, 0.333, "0.334"),
+        (0.0195, 0.0198, "0.019"),
+        (0.3333333, 1 / 3, "0.33"),
+        (float("nan"), 1.0, "–"),
+        (float("inf"), 1.0, "∞"),
+    ],
+)
+def test_a_value_does_not_read_as_the_limit_that_it_misses(value, limit, text):
+    assert stress_results.format_value(value, limit) == text
+
+
+def test_a_value_without_a_unit_has_no_blank_behind_it():
+    outcomes = {name: {"net": StressResult(value, "", 0.02)} for name, value in
+                (("a", 0.0204), ("b", 0.01))}  # fmt: skip
+    text = stress_results.format_summary_per_network(outcomes, {"a": "a", "b": "b"}, {})
+    assert "- a: 0.0204, limit at most 0.02\n" in text and "b (0.01)" in text
+
+
 def test_a_reference_beyond_the_limit_is_no_failure_of_the_network():
     found = StressResult(2.0, "px", 1.0, varied="video", unjudged=[("light of one view", 3.0)])
     titles, outcomes = {"straight": "straight"}, {"straight": {"net": found}}

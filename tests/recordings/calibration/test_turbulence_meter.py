@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from src.calibrate import calibrate, measure_turbulence_in_video
+from src.figures import calibration_figures
 from src.recordings.calibration import point_tracking, tilt_covariance, turbulence_meter
 from src.recordings.files import videos
 from src.recordings.files.turbulence_file import IntervalEstimate, read_turbulence_file
@@ -263,6 +264,14 @@ def folder(tmp_path_factory):
     for number, frame in enumerate(film(fields(8, 0.5, 0.5, 16))):
         cv2.imwrite(str(folder / f"{number:03}.png"), np.round(frame * 255))
     return folder
+
+
+@pytest.mark.parametrize(
+    ("correlation", "title"),
+    [(1.12, "tracking error: 0.12 above the fit at distance 0"), (0.9, ""), (float("nan"), "")],
+)
+def test_an_excess_at_distance_0_is_told_where_there_is_one(correlation, title):
+    assert calibration_figures.describe_excess(correlation) == title
 
 
 def test_calibrate_writes_a_file_and_a_figure(folder, tmp_path):
