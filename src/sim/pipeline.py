@@ -22,7 +22,13 @@ from src.sim.sensor.engines.records import Grids
 from src.sim.sensor.engines.run import zeros
 from src.sim.sensor.response import decode_srgb, encode_srgb
 from src.sim.sensor.sensor import Sensor, ViewFrames, simulate_voxels
-from src.sim.turbulence.contract import ClipTurbulence, Crop, Tilt, TurbulenceModel
+from src.sim.turbulence.contract import (
+    ClipTurbulence,
+    Crop,
+    Tilt,
+    TurbulenceModel,
+    describe_clip_turbulence,
+)
 
 Pictures = Float[Tensor, "n windows 1 h w"]  # code values in [0, 1]
 
@@ -192,7 +198,8 @@ class Pipeline:
 
     def turbulence_record(self, draw: ClipParameters) -> dict:
         """Return the parameters of a clip's turbulence; a cache holds its own."""
-        return dict(self.turbulence_operator(draw).metadata)
+        operator, generator = self.turbulence_operator(draw), self.turbulence_generator(draw)
+        return describe_clip_turbulence(operator, generator)
 
     def _record(self, draw: ClipParameters) -> dict:
         drawn = {"clip": draw.number, "name": draw.clip.name, "source": draw.clip.source}
