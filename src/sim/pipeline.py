@@ -175,7 +175,7 @@ class Pipeline:
             voxels=voxels,
             target=clean.to(views.device)[:, :, None],
             turbulent=turbulent[:, :, None],
-            window_s=torch.tensor([step / clip.fps for clip in clips]),
+            window_s=torch.tensor([step / clip.fps for clip in clips], dtype=torch.float32),
             positions=self.optics.positions,
             parameters=[self._record(draw) for draw in draws],
         )
@@ -242,7 +242,7 @@ def concatenate_samples(samples: Sequence[Sample], voxels: Tensor | None = None)
 def allocate_float32(shape: Sequence[int], device: torch.device) -> Tensor:
     """Return float32 to be filled, on the CPU in numpy's huge pages, a third of the cost."""
     if device.type != "cpu":
-        return torch.empty(*shape, device=device)
+        return torch.empty(*shape, dtype=torch.float32, device=device)
     return torch.from_numpy(np.empty(tuple(shape), np.float32))
 
 
