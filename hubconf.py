@@ -1,7 +1,8 @@
 """Shipped networks for code of one's own, without the rest of the repository:
 
     net = torch.hub.load("<folder of this repository>", "setnet_small", source="local")
-    frame, state = net(voxels, state)
+    with torch.inference_mode():  # without it the state keeps the graph of all windows
+        frame, state = net(voxels, state)
 
 `voxels` (n, views, bins, h, w): sums of polarity in `bins` hat functions over a window
 (docs/conventions.md); `frame` (n, 1, h, w) in [0, 1]; `state` None starts a sequence.  The networks

@@ -48,7 +48,13 @@ SIDE, FILM, FRAMES, FPS, NOISE = 256, 512, 240, 30.0, 0.01
 RMS, HALF, DECAY, TIMES = (0.25, 1.5), (5.0, 70.0), (0.04, 0.2), ("ar1", "frozen_flow")
 WARPS = (3.3, 6.7, 13.3, 26.6, 53.3), (0.25, 0.75, 1.5)  # half lengths, rms
 COMPRESSED_WARPS = 13.3, (0.0, 0.1, 0.25, 0.5)  # half length, rms
-KEYS = ("rms_px", "half_length_px", "whole_share", "decay_s", "blur_px")
+KEYS = (
+    "tilt_rms_px",
+    "tilt_correlation_half_length_px",
+    "global_tilt_share",
+    "tilt_correlation_time_s",
+    "blur_px",
+)
 
 
 def load_photograph(k: int, wide: int = FILM) -> Float[np.ndarray, "h w"]:
@@ -190,18 +196,19 @@ def compare_measurement(
 ) -> dict[str, float]:
     """Return what was found over what is known, and whether the intervals hold the atmosphere's."""
     rms, half, whole, decay = describe_tilt(tilt)
-    length = _number(found.half_length_px)
+    length = _number(found.tilt_correlation_half_length_px)
     own, reach = path.tilt_std_px(SIDE), path.tilt_correlation_half_length_px(SIDE)
     return {
-        "rms of clip": found.rms_px.value / rms,
-        "rms of atmosphere": found.rms_px.value / own,
-        "rms held": _holds(found.rms_px, own),
+        "rms of clip": found.tilt_rms_px.value / rms,
+        "rms of atmosphere": found.tilt_rms_px.value / own,
+        "rms held": _holds(found.tilt_rms_px, own),
         "half length of clip": length / half,
         "half length of atmosphere": length / reach,
-        "half length held": _holds(found.half_length_px, reach),
-        "whole view less clip's": found.whole_share.value - whole,
-        "decay of clip": _number(found.decay_s) / decay,
-        "decay of atmosphere": _number(found.decay_s) / tilt_correlation_time_s(path),
+        "half length held": _holds(found.tilt_correlation_half_length_px, reach),
+        "whole view less clip's": found.global_tilt_share.value - whole,
+        "decay of clip": _number(found.tilt_correlation_time_s) / decay,
+        "decay of atmosphere": _number(found.tilt_correlation_time_s)
+        / tilt_correlation_time_s(path),
         "blur of atmosphere": found.blur_px.value / path.blur_px(SIDE),
         "blur held": _holds(found.blur_px, path.blur_px(SIDE)),
     }
@@ -277,8 +284,11 @@ def measure_warps(
         frames, tilt = warp_photograph(load_photograph(k, SIDE), half, rms, k)
         found = measure_or_refusal(compress(frames))
         if not isinstance(found, str):
-            known, length = describe_tilt(tilt), _number(found.found.half_length_px)
-            rows.append((found.found.rms_px.value / known[0], length / known[1]))
+            known, length = (
+                describe_tilt(tilt),
+                _number(found.found.tilt_correlation_half_length_px),
+            )
+            rows.append((found.found.tilt_rms_px.value / known[0], length / known[1]))
     ranges = ("-".join(f"{v:.2f}" for v in sorted(v)) for v in zip(*rows, strict=True))
     return ", ".join(ranges) or "refused"
 

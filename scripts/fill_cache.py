@@ -15,6 +15,7 @@ from omegaconf import DictConfig
 
 from scripts.parallel_fill import fill
 from src.app import entry_point, simulation
+from src.app.renamed_keys import refuse_renamed_keys
 from src.training.disk_cache import DiskClipCache
 from src.training.worker_process import prepare_worker_process
 
@@ -52,6 +53,7 @@ def _run_worker(cache: DiskClipCache) -> None:
 @hydra.main(version_base=None, config_path="../conf", config_name="train")
 def main(cfg: DictConfig) -> None:
     """Read the config and fill the caches it names."""
+    refuse_renamed_keys(cfg)
     workers = cfg.get("workers", 1)
     if type(workers) is not int or workers < 1:
         raise ValueError(f"workers must be a whole number >= 1, got {workers}")

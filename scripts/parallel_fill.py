@@ -202,7 +202,8 @@ def prepare_turbulence(
     turbulence: Turbulence, frames: int, generator: torch.Generator, crop: Crop
 ) -> PreparedTurbulence:
     """Return the turbulence of one clip of so many `frames`, drawn for `crop` on the CPU."""
-    return PreparedTurbulence(turbulence.metadata, crop, turbulence.plan(frames, generator, crop))
+    metadata = turbulence.clip_metadata(generator.clone_state())
+    return PreparedTurbulence(metadata, crop, turbulence.plan(frames, generator, crop))
 
 
 def prepares_turbulence(device: torch.device) -> bool:

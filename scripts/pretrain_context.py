@@ -25,6 +25,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from src.app import build, entry_point, hardware
+from src.app.renamed_keys import refuse_renamed_keys
 from src.deploy.cpu_features import is_bf16_faster
 from src.models import files
 from src.models.setnet import CELL_PX, SetNet
@@ -139,6 +140,7 @@ def teach(cfg: DictConfig, clips: int, steps: int) -> None:
 @hydra.main(version_base=None, config_path="../conf", config_name="train")
 def main(cfg: DictConfig) -> None:
     """Glue between Hydra and `teach`."""
+    refuse_renamed_keys(cfg)
     teach(cfg, cfg.get("clips", 800), cfg.get("steps", 1000))
 
 

@@ -89,8 +89,8 @@ def plot_prior(
     axes.add_patch(box)
     for file, marker in zip(measured, "X*PDv^s", strict=False):
         air = safe_yaml.read(file)
-        at = [air[key]["value"] for key in ("half_length_px", "rms_px")]
-        ends = [air[key]["interval"] for key in ("half_length_px", "rms_px")]
+        at = [air[key]["value"] for key in ("tilt_correlation_half_length_px", "tilt_rms_px")]
+        ends = [air[key]["interval"] for key in ("tilt_correlation_half_length_px", "tilt_rms_px")]
         error = [
             np.abs(np.array(end) - value)[:, None] for value, end in zip(at, ends, strict=True)
         ]

@@ -20,6 +20,7 @@ from omegaconf import DictConfig
 from torch import Tensor, nn
 
 from src.app import build, entry_point
+from src.app.renamed_keys import refuse_renamed_keys
 from src.models import files
 from src.models.layers import PreActivationBlock
 from src.models.setnet import SetNet
@@ -144,6 +145,7 @@ def begin(cfg: DictConfig) -> None:
 @hydra.main(version_base=None, config_path="../conf", config_name="train")
 def main(cfg: DictConfig) -> None:
     """Glue between Hydra and `begin`."""
+    refuse_renamed_keys(cfg)
     begin(cfg)
 
 

@@ -1,10 +1,13 @@
 """Annotations of `src` and `baselines` are checked while the tests run; shared fixtures."""
 
 import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import jaxtyping
 import pytest
+import torch
 
 import src  # noqa: F401 - sets OpenCV's limits before a test imports it
 from tests.faults.harness import leave_slices_out
@@ -23,6 +26,17 @@ def checked_modules() -> list[str]:
     names = [".".join(file.relative_to(ROOT).with_suffix("").parts) for file in files]
     left_out = ("src.app.", ".engines.", ".__init__")
     return [name for name in names if not any(part in f"{name}." for part in left_out)]
+
+
+@contextmanager
+def default_dtype(dtype: torch.dtype) -> Iterator[None]:
+    """Make tensors of `dtype` where nothing else is asked for."""
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(dtype)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(before)
 
 
 jaxtyping.jaxtyped = check_annotations  # what the hook decorates everything with

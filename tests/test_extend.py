@@ -28,6 +28,10 @@ TINY = {  # what is added to a command, so that it is over in seconds
     "reconstruct": ["fps=1000", "hydra.run.dir=out/digit", "output_format=hdf5"],
     "report": [],
 }
+OWN_KEYS = {  # of classes of one's own, with names that keys of this repository once had
+    "turbulence=shimmer": ["turbulence.rms_px=3"],
+    "scene=snow": ["++scene.speed=1"],
+}
 STEP = re.compile(r"(New|In) `([^`]+)`(?:, below `([^`]+)`)?:\n\n```\w+\n(.*?)```", re.S)
 DRIVER = """
 import json, runpy, sys
@@ -75,7 +79,11 @@ def commands(page: str) -> list[list[str]]:
         line for block in re.findall(r"```sh\n(.*?)```", page, re.S) for line in block.split("\n")
     ]
     words = [line.split() for line in lines if line]
-    return [[*line, *TINY[line[2].removeprefix("src.")]] for line in words]
+    own = [[key for word in line for key in OWN_KEYS.get(word, [])] for line in words]
+    return [
+        [*line, *TINY[line[2].removeprefix("src.")], *keys]
+        for line, keys in zip(words, own, strict=True)
+    ]
 
 
 def test_the_page_is_followed(copy, page):

@@ -60,6 +60,7 @@ def test_clips_are_those_of_a_disk_cache_and_drawn_without_the_device(tmp_path):
         assert torch.equal(views, clip.views) and torch.equal(clean, clip.clean)
         assert views.dtype == clean.dtype == torch.float16
         assert json.loads(json.dumps(metadata)) == clip.metadata
+        assert metadata["record"]["temporal_model"] != "mixed"  # that of the clip
 
 
 def test_turbulence_that_is_prepared_elsewhere_gives_the_same_clips(imported, monkeypatch):

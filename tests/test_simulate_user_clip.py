@@ -22,7 +22,7 @@ from src.sim import noise
 from src.sim.scenes.user_clip import clip_from_array
 from src.sim.turbulence.operator import Turbulence
 from src.simulate import print_files, simulate
-from tests.conftest import ROOT
+from tests.conftest import ROOT, default_dtype
 from tests.sim.scenes.test_user_clip import LEVELS, write_film
 from tests.test_recording_entry_points import config
 
@@ -57,6 +57,22 @@ def test_a_video_gives_events_geometry_and_truth_of_all_its_frames(tmp_path, cap
         assert file.attrs["threshold"] == drawn["threshold"]
     assert (tmp_path / "run" / "views.gif").stat().st_size > 1000
     assert not list(tmp_path.rglob("*partial*"))
+
+
+@pytest.mark.parametrize("turbulence", ["none", "weak"])
+def test_the_default_type_of_tensors_changes_nothing(turbulence):
+    given = {"turbulence": turbulence, "views": 2, "fps": 120}
+    ours = simulate_arrays(textured(), **given)
+    with default_dtype(torch.float64):
+        theirs = simulate_arrays(textured(), **given)
+    for one, other in zip(ours, theirs, strict=True):
+        assert one.dtype == other.dtype and (one == other).all()
+    assert ours.drawn == theirs.drawn
+
+
+def test_overrides_in_one_word_are_refused():
+    with pytest.raises(ValueError, match=r"^overrides must be a list .*\['sensor.threshold=1'\]"):
+        simulate_arrays(textured(2), fps=30, overrides="sensor.threshold=1")
 
 
 def test_parts_are_those_of_the_whole_clip(tmp_path, monkeypatch):
@@ -202,6 +218,7 @@ def test_a_seed_draws_anew_and_the_same_seed_the_same():
         ({"overrides": ["sensor.threshold=7"]}, r"^sensor.threshold must be in .* got 7$"),
         ({"overrides": ["turbulence.tolerance=null"]}, r"turbulence.tolerance must be in \(0, 1\]"),
         ({"overrides": ["calm=1"]}, "calm is now loss.static_flicker.weight"),
+        ({"overrides": ["+calm=1"]}, "calm is now loss.static_flicker.weight"),
         (
             {"turbulence": "measured", "overrides": ["turbulence.measured=air (1).yaml"]},
             r"turbulence.measured must be .*air \(1\).yaml",
@@ -261,7 +278,7 @@ def test_an_array_moves_as_a_photograph_does():
         (["video=my.mkv", "photo=a.png"], "video must be null with photo=a.png"),
         (["video=my.mkv", "like=config.yaml"], "like must be null with video or photo"),
         (["video=my.mkv", "write=a.txt"], "write"),
-        (["video=my.mkv", "seconds=0.5"], "seconds must be null but for a photograph, .*got 0.5"),
+        (["video=my.mkv", "seconds=0.5"], "seconds must be left out but for a photograph, .* 0.5"),
         (["video=my.mkv", "speed_widths_per_s=1"], "speed_widths_per_s must be 0 but for a photog"),
     ],
 )

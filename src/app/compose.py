@@ -16,7 +16,7 @@ from src.app.renamed_keys import (
     explain_refused_key,
     flatten_keys,
     read_override_key,
-    refuse_renamed_overrides,
+    refuse_renamed_keys,
 )
 
 CONF = str(Path(__file__).resolve().parents[2] / "conf")
@@ -52,9 +52,9 @@ def compose_checked_config(
     Raises ValueError for a key or a choice that is none and for a value of another kind.
     """
     refuse_empty_paths(overrides, name)
-    refuse_renamed_overrides(overrides)
     lines = [*chosen, *quote_paths(overrides, name)]
     cfg = compose_config(name, *lines)
+    refuse_renamed_keys(cfg)
     groups = [line for line in lines if config_choices(read_override_key(line))]
     shipped = compose_config(name, *groups)
     OmegaConf.set_struct(shipped, False)

@@ -30,11 +30,7 @@ from src.app.path_overrides import (
     refuse_empty_paths,
     unquote_override,
 )
-from src.app.renamed_keys import (
-    read_override_key,
-    refuse_renamed_keys,
-    refuse_renamed_overrides,
-)
+from src.app.renamed_keys import read_override_key, refuse_renamed_keys
 from src.app.stop_signals import StoppedBySignal, stop_by_signals
 from src.models import files
 from src.models.checkpoints import list_checkpoints
@@ -95,7 +91,6 @@ def run_main(main: Callable[[], None]) -> None:
     try:
         with stop_by_signals():
             refuse_empty_paths(sys.argv[1:], Path(sys.argv[0]).stem)
-            refuse_renamed_overrides(sys.argv[1:])
             main()
     except JobFailed as error:
         _print_failed_jobs(Path(str(error)), start)

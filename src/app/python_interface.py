@@ -51,7 +51,7 @@ class SimulatedClip:
     second), `severity` (a word), `d_over_r0` (D/r0), `tilt_px`, `blur_px` (beyond diffraction) and
     `tilt_and_blur_px` (rms along an axis, pixels of the clip), `tilt_correlation_half_length_px`,
     `tilt_correlation_time_s` (to 1/e), `temporal_model` and its `wind_m_s` (rms, 0 of ar1); of
-    turbulence=recorded or of a class of your own what it names.
+    turbulence=recorded what it names.
     """
 
     clean: Float[np.ndarray, "frames h w"]
@@ -90,6 +90,8 @@ def simulate(
     for `seconds` of a video and a part of a photograph, and for overrides that are none, are
     arguments, or have no effect here (of `scene`, or of the command line alone).
     """
+    if isinstance(overrides, str):
+        raise ValueError(f"overrides must be a list of words, as in [{overrides!r}], got a str")
     overrides = list(overrides)
     _refuse_other_overrides(overrides)
     if not isinstance(seed, int | np.integer):

@@ -1,7 +1,7 @@
 """Config keys and choices that are none: an error that names the new or the nearest one."""
 
 import re
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from difflib import get_close_matches
 from pathlib import Path
 
@@ -73,17 +73,10 @@ def read_override_key(override: str) -> str:
     return override.partition("=")[0].strip().lstrip("+~").partition("@")[0]
 
 
-def refuse_renamed_overrides(arguments: Iterable[str]) -> None:
-    """Raise ValueError for a former key or choice among the overrides of a command line."""
-    for argument in arguments:
-        key, value = read_override_key(argument).replace("/", "."), argument.partition("=")[2]
-        for former in (key, *(f"{key}={choice.strip()}" for choice in value.split(","))):
-            if explanation := describe_renaming(former):
-                raise ValueError(explanation)
-
-
 def refuse_renamed_keys(cfg: DictConfig) -> None:
-    """Raise ValueError for a former key in `cfg`, such as one of a user's config file."""
+    """Raise ValueError for a former key in `cfg`, such as one of a user's config file, or one added
+    by `+`; arguments of classes of other packages have any names.
+    """
     for key in flatten_keys(_drop_other_classes(OmegaConf.to_container(cfg, resolve=False))):
         if explanation := describe_renaming(key):
             raise ValueError(explanation)

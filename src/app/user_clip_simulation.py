@@ -25,7 +25,7 @@ from src.sim.scenes import user_clip
 from src.sim.scenes.user_clip import UserClip
 from src.sim.sensor.response import decode_srgb, encode_srgb
 from src.sim.sensor.sensor import EventSensor
-from src.sim.turbulence.contract import ClipTurbulence
+from src.sim.turbulence.contract import ClipTurbulence, describe_clip_turbulence
 from src.sim.turbulence.operator import Turbulence
 
 PART_BYTES = 1 << 27  # of all views at a time
@@ -82,11 +82,9 @@ class UserClipSimulation:
     def drawn_parameters(self) -> dict[str, Any]:
         """Return what was drawn."""
         own = {"name": self.clip.name, "threshold": self.sensor.threshold}
-        operator = self.turbulence
-        drawn = operator.metadata
-        if isinstance(operator, Turbulence):
-            drawn = operator.clip_metadata(noise.generator(noise.key(self.key, "turbulence")))
-        return own | {"simulated_fps": self.simulated_fps} | dict(drawn)
+        generator = noise.generator(noise.key(self.key, "turbulence"))
+        drawn = describe_clip_turbulence(self.turbulence, generator)
+        return own | {"simulated_fps": self.simulated_fps} | drawn
 
     def describe(self) -> str:
         """Return size, rate, frames, turbulence and threshold in one line."""

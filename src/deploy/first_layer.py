@@ -28,7 +28,7 @@ class E2VIDRemainder(nn.Module):
         self.kernel, self.bias = (part.float().numpy() for part in network.first_layer.parameters())
         self.network, self.dtype = network.to(dtype), dtype
         with torch.no_grad():
-            head = torch.zeros(1, *padded, len(self.kernel))
+            head = torch.zeros(1, *padded, len(self.kernel), dtype=torch.float32)
             _, state = self.network.after_first_layer(self._to_first(head), None)
         leaves, self.structure = pytree.tree_flatten(state)
         self.example = [head, *(torch.zeros_like(leaf) for leaf in leaves)]  # inputs of `forward`

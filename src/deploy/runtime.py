@@ -27,7 +27,7 @@ from src.deploy.tile_batches import EagerBackend
 from src.models.e2vid import E2VID
 from src.models.folding import inference_copy
 from src.models.setnet import SetNet
-from src.sim.optics import Position, is_arranged_as_layout, layout
+from src.sim.optics import Position
 
 EVENT_LIST_FORMS = ("float32", "bf16", "openvino")
 SIDE_MULTIPLE = 8  # sides are padded to it by reflection, as the networks do
@@ -98,12 +98,7 @@ class EventListRuntime:
             self.runner = SetNetTiles(copied, where, padded, dtype, backend, threads)
         else:
             assert isinstance(copied, E2VID)
-            if (given := self.views) != (views := copied.views):
-                wanted = f"{views} (row, col) for this network"
-                raise ValueError(f"positions must be {wanted}, got {given}: {list(positions)}")
-            if not is_arranged_as_layout(positions):
-                wanted = f"arranged as {list(layout(views))} for this network"
-                raise ValueError(f"positions must be {wanted}, got {list(positions)}")
+            copied.check_positions(positions)
             self.runner = E2VIDOverEvents(copied, padded, dtype, backend, threads)
         self.state_arrays, self.warned = _describe_arrays(self.runner.state), set[str]()
 
@@ -112,7 +107,8 @@ class EventListRuntime:
 
         Events of one window in order of time, arrays of one length: `t`, `t0`, `t1` in seconds, the
         window of a length in WINDOW_RANGE_S, `x`, `y` in pixels, `view` an index into positions,
-        `p` in {-1, 1} or, as floats, weights.
+        `p` in {-1, 1} or, as floats, weights; a warning says so, once, where these are 0 and 1
+        alone, as OFF and ON are in some files.
         Those outside t0 <= t <= t1, but for rounding, have no part in it; a warning says so where
         nearly all are.
         Raises ValueError, and leaves the state, for another window and for events that are out of
@@ -188,6 +184,7 @@ class EventListRuntime:
         t = _clip_rounded(t, float(t0), float(t1))
         inside = np.searchsorted(t, t1, "right") - np.searchsorted(t, t0)
         self._warn_of_units(given[0], t0, t1)
+        self._warn_of_polarities(given[3])
         if len(t) and inside < LEAST_INSIDE * len(t):
             reach = f"{t[0]:g} to {t[-1]:g}, the window is {t0:g} to {t1:g}"
             said = f"{inside} of {len(t)} events lie in the window: t is {reach}, in seconds"
@@ -202,6 +199,13 @@ class EventListRuntime:
             if step * LEAST_TIME_STEPS > t1 - t0:
                 said = f"t is {t.dtype}, in steps of {step:g} s at {t[-1]:g} s: float64 resolves it"
                 self._warn_once("steps", said)
+
+    def _warn_of_polarities(self, p: np.ndarray) -> None:
+        """Warn of weights that are 0 and 1; others need one pass over them."""
+        is_float = len(p) and p.dtype.kind == "f" and "p" not in self.warned
+        if is_float and p.min() == 0 and p.max() == 1 and np.isin(p, (0, 1)).all():
+            said = "p is 0 and 1 as floats, so that OFF events have no weight"
+            self._warn_once("p", f"{said}: 2 * p - 1 gives OFF and ON")
 
     def _warn_once(self, what: str, said: str) -> None:
         """Warn; of windows alike once, as the text differs from one to the next."""

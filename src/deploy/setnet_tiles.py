@@ -204,7 +204,9 @@ class WholeFrame:
         held = [size[1:] + size[:1] for size in network.context.held_map_sizes(*near)]
 
         def compile_module(module: nn.Module, *shapes: tuple[int, ...]) -> Any:
-            return backend(module, [torch.zeros(1, *shape) for shape in shapes], threads)
+            return backend(
+                module, [torch.zeros(1, *shape, dtype=torch.float32) for shape in shapes], threads
+            )
 
         window = WholeWindow(network, positions, dtype)
         given = [(*near, channels) for channels in (c, window.memory.kernel.shape[1], 1, c)]

@@ -67,7 +67,7 @@ class TileModule:
         self.sizes = sizes
         self.compiled, self.inputs, self.outputs = {}, {}, {}
         for size in sizes:
-            example = [torch.zeros(size, *shape) for shape in shapes]
+            example = [torch.zeros(size, *shape, dtype=torch.float32) for shape in shapes]
             with torch.inference_mode():
                 self.outputs[size] = [module(*example).numpy().copy()]
             self.inputs[size] = [part.numpy() for part in example]

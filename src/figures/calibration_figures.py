@@ -200,7 +200,7 @@ def draw_measured_turbulence(measured: TurbulenceMeasurement, title: str, path: 
     fit = measured.fitted_distance_px, tilt.fitted_correlation
     distance.plot(*fit, color="tab:orange", label="fit")
     distance.axhline(0.5, color="gray", lw=0.6)
-    _mark_estimate(distance, found.half_length_px, "half length", "px")
+    _mark_estimate(distance, found.tilt_correlation_half_length_px, "half length", "px")
     distance.set_xscale("symlog", linthresh=2)
     distance.set_xticks(DISTANCE_TICKS, map(str, DISTANCE_TICKS))
     distance.set(
@@ -212,7 +212,7 @@ def draw_measured_turbulence(measured: TurbulenceMeasurement, title: str, path: 
     lag.plot(np.arange(len(tilt.lag_correlation)) / (fps or 1), tilt.lag_correlation, "o-", ms=3)
     for level in (0, np.exp(-1)):
         lag.axhline(level, color="gray", lw=0.6)
-    _mark_estimate(lag, found.decay_s, "1/e", "s")
+    _mark_estimate(lag, found.tilt_correlation_time_s, "1/e", "s")
     text = f"1/e after {tilt.decay_frames:.1f} frames"
     if tilt.decay_frames > (longest := longest_decay_frames(measured.frames)):
         text = f"1/e after {longest:.0f} frames or more"

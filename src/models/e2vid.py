@@ -19,8 +19,13 @@ from torch.nn.utils.parametrizations import spectral_norm as normalise_spectrum
 from torch.utils import _pytree as pytree
 
 from src.models.layers import ConvGRU, ConvLSTM, ResidualBlock, pad_centred_to_multiple
-from src.models.network import WINDOW_S, EventToVideoNetwork, check_voxel_shape
-from src.sim.optics import Position, layout, most_central_view_index
+from src.models.network import (
+    WINDOW_S,
+    EventToVideoNetwork,
+    check_voxel_shape,
+    check_window_length,
+)
+from src.sim.optics import Position, is_arranged_as_layout, layout, most_central_view_index
 
 CELLS = {"convlstm": ConvLSTM, "convgru": ConvGRU}
 ACTIVATIONS = {"sigmoid": torch.sigmoid, "none": lambda x: x}
@@ -94,27 +99,49 @@ class E2VID(EventToVideoNetwork):
     ) -> tuple[Float[Tensor, "n 1 h w"], Any]:
         """Return the frame at the end of the window and the state, one entry per scale.
 
-        Views are in the order of training; `window_s` and `positions` have no part in it.  Raises
-        ValueError for another shape, or when views, bins or the sizes of the state do not fit.
+        Views are in the order of `layout`.  `window_s` and `positions` change nothing.  Raises
+        ValueError for another shape, for positions of another number or arrangement, and when
+        views, bins, the window's length or the sizes of the state do not fit.
         """
-        x, (top, left) = self._padded(voxels)
+        x, (top, left) = self._padded(voxels, window_s, positions)
         self._check_state(state, x)
         height, width = voxels.shape[-2:]
         frame, after = self.after_first_layer(self.first_layer(x), state)
         return frame[..., top : top + height, left : left + width], after
 
     def warm_up(self, voxels: Tensor, state: Any = None, **options: Any) -> tuple:
-        """Return the state that `forward` does, without its decoder."""
-        x, _ = self._padded(voxels)
+        """Return the state that `forward` does, without its decoder; ValueError as there."""
+        x, _ = self._padded(voxels, **options)
         self._check_state(state, x)
         return self.encode(self.first_layer(x), state)[2]
 
-    def _padded(self, voxels: Tensor) -> tuple[Tensor, tuple[int, int]]:
+    def check_positions(self, positions: Sequence[Position]) -> None:
+        """Raise ValueError unless `positions` are (row, col), one for each view, that stand to each
+        other as in `layout`.
+        """
+        if len(positions) != self.views:
+            wanted = f"{self.views} (row, col) for this network"
+            raise ValueError(f"positions must be {wanted}, got {len(positions)}: {list(positions)}")
+        if not is_arranged_as_layout(positions):
+            wanted = f"arranged as {list(layout(self.views))} for this network"
+            raise ValueError(f"positions must be {wanted}, got {list(positions)}")
+
+    def _padded(
+        self,
+        voxels: Tensor,
+        window_s: float | Tensor = WINDOW_S,
+        positions: Sequence[Position] | None = None,
+    ) -> tuple[Tensor, tuple[int, int]]:
         check_voxel_shape(voxels)
         if tuple(voxels.shape[1:3]) != (self.views, self.bins):
             wanted, got = (self.views, self.bins), tuple(voxels.shape[1:3])
-            raise ValueError(f"optics.views, bins must be {wanted} for this network, got {got}")
-        return pad_centred_to_multiple(voxels.flatten(1, 2), 2**SCALES)
+            where = "for this network (in commands: optics.views, bins)"
+            raise ValueError(f"views, bins must be {wanted} {where}, got {got}")
+        check_window_length(window_s)
+        if positions is not None:
+            self.check_positions(positions)
+        stacked = voxels.flatten(1, 2).to(self.first_layer.weight.dtype)
+        return pad_centred_to_multiple(stacked, 2**SCALES)
 
     def _check_state(self, state: Any, x: Float[Tensor, "n c h w"]) -> None:
         """Raise ValueError unless `state` has the sizes that padded voxels `x` leave."""

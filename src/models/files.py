@@ -53,7 +53,8 @@ def load(name_or_path: str | Path, allowed_packages: Sequence[str] = ()) -> nn.M
     check_weights_fit(
         f"ckpt does not fit {type(empty).__name__} in {path}", empty.state_dict(), weights
     )
-    network = _build(spec, path, allowed_packages)
+    with torch.random.fork_rng(devices=[]):  # it begins with random weights
+        network = _build(spec, path, allowed_packages)
     network.load_state_dict(weights)
     fold_parametrizations(network)
     return network.float().eval()

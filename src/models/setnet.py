@@ -70,7 +70,7 @@ from src.models.background import REVEALING_EVENTS, blend_background
 from src.models.cell_clock import TRACE_TAU_S, ClockTick, run_clock
 from src.models.context_pyramid import ContextPyramid, smooth_context
 from src.models.layers import EqualDCConv, pad_centred_to_multiple, scan_windows
-from src.models.network import EventToVideoNetwork, check_voxel_shape
+from src.models.network import EventToVideoNetwork, check_voxel_shape, check_window_length
 from src.models.setnet_state import Context, SetNetState
 from src.models.time_gated_memory import TimeGatedMemory
 from src.models.view_kernels import ViewKernels
@@ -172,6 +172,9 @@ class SetNet(EventToVideoNetwork):
         the batch (m = windows * n, in order of time), the decoder with `output_windows` only.
         """
         n, windows, views, bins, height, width = voxels.shape
+        if not (n and windows):
+            wanted = "one clip and one window or more"
+            raise ValueError(f"voxels must hold {wanted}, got {tuple(voxels.shape)}")
         where = self.checked_positions(views, bins, positions)
         seconds = _durations(window_s, voxels)
         padded, (top, left) = pad_centred_to_multiple(voxels.flatten(0, 2), 8)
@@ -339,15 +342,10 @@ def _sizes(state: SetNetState) -> list:
 
 def _durations(window_s: float | Tensor, voxels: Tensor) -> Float[Tensor, "_n 1 1 1"]:
     """Return the length of the window, in seconds, one for each clip or for all."""
+    check_window_length(window_s)
     if isinstance(window_s, Tensor):
-        is_traced = torch.jit.is_tracing() or torch.compiler.is_compiling()
-        is_known = window_s.device.type == "cpu" and not is_traced
-        if is_known and not ((window_s > 0) & window_s.isfinite()).all():
-            raise ValueError(f"window_s must be > 0 seconds, got {window_s.tolist()}")
         return window_s.to(voxels.device).float().view(-1, 1, 1, 1)
-    if not 0 < window_s < math.inf:
-        raise ValueError(f"window_s must be > 0 seconds, got {window_s}")
-    return torch.full((1, 1, 1, 1), window_s, device=voxels.device)
+    return torch.full((1, 1, 1, 1), window_s, dtype=torch.float32, device=voxels.device)
 
 
 def _as_conv_input(

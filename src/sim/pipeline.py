@@ -22,7 +22,13 @@ from src.sim.sensor.engines.records import Grids
 from src.sim.sensor.engines.run import zeros
 from src.sim.sensor.response import decode_srgb, encode_srgb
 from src.sim.sensor.sensor import Sensor, ViewFrames, simulate_voxels
-from src.sim.turbulence.contract import ClipTurbulence, Crop, Tilt, TurbulenceModel
+from src.sim.turbulence.contract import (
+    ClipTurbulence,
+    Crop,
+    Tilt,
+    TurbulenceModel,
+    describe_clip_turbulence,
+)
 
 Pictures = Float[Tensor, "n windows 1 h w"]  # code values in [0, 1]
 
@@ -169,7 +175,7 @@ class Pipeline:
             voxels=voxels,
             target=clean.to(views.device)[:, :, None],
             turbulent=turbulent[:, :, None],
-            window_s=torch.tensor([step / clip.fps for clip in clips]),
+            window_s=torch.tensor([step / clip.fps for clip in clips], dtype=torch.float32),
             positions=self.optics.positions,
             parameters=[self._record(draw) for draw in draws],
         )
@@ -192,7 +198,8 @@ class Pipeline:
 
     def turbulence_record(self, draw: ClipParameters) -> dict:
         """Return the parameters of a clip's turbulence; a cache holds its own."""
-        return dict(self.turbulence_operator(draw).metadata)
+        operator, generator = self.turbulence_operator(draw), self.turbulence_generator(draw)
+        return describe_clip_turbulence(operator, generator)
 
     def _record(self, draw: ClipParameters) -> dict:
         drawn = {"clip": draw.number, "name": draw.clip.name, "source": draw.clip.source}
@@ -235,7 +242,7 @@ def concatenate_samples(samples: Sequence[Sample], voxels: Tensor | None = None)
 def allocate_float32(shape: Sequence[int], device: torch.device) -> Tensor:
     """Return float32 to be filled, on the CPU in numpy's huge pages, a third of the cost."""
     if device.type != "cpu":
-        return torch.empty(*shape, device=device)
+        return torch.empty(*shape, dtype=torch.float32, device=device)
     return torch.from_numpy(np.empty(tuple(shape), np.float32))
 
 

@@ -6,6 +6,7 @@ last event, so that all views share one clock and an empty view shifts nothing.
 """
 
 import warnings
+from numbers import Integral
 from typing import no_type_check
 
 import numpy as np
@@ -35,11 +36,12 @@ def voxel_grid(
     if not t.shape == x.shape == y.shape == p.shape or t.ndim != 1:
         shapes = [part.shape for part in (t, x, y, p)]
         raise ValueError(f"t, x, y, p must be of one length, got shapes {shapes}")
-    if bins < 1 or height < 1 or width < 1:
-        raise ValueError(f"bins, height, width must be positive, got {bins}, {height}, {width}")
+    sizes = bins, height, width
+    if not all(isinstance(size, Integral) and size >= 1 for size in sizes):
+        raise ValueError(f"bins, height, width must be whole numbers >= 1, got {sizes}")
     if not (t1 > t0 and np.isfinite(t0) and np.isfinite(t1)):
         raise ValueError(f"voxel_grid needs finite t0 < t1, got t0={t0}, t1={t1}")
-    grid, t0, t1 = torch.zeros(bins, height, width), float(t0), float(t1)
+    grid, t0, t1 = torch.zeros(sizes, dtype=torch.float32), float(t0), float(t1)
     if t.size == 0:
         return grid
     if x.dtype.kind not in "iu" or y.dtype.kind not in "iu":

@@ -43,6 +43,8 @@ WRONG = [
     ("train", ["trainer.max_steps=abc"], "trainer.max_steps must be a whole number, got abc"),
     ("train", ["ckpt=setnet_medium"], "ckpt=setnet_medium must be of the network that is trained"),
     ("train", ["calm=1"], "calm is now loss.static_flicker.weight"),
+    ("simulate", ["turbulence.rms_px=3"], "turbulence.rms_px is now turbulence.tilt_rms_px"),
+    ("simulate", ["+turbulence.rms_px=3"], "turbulence.rms_px is now turbulence.tilt_rms_px"),
     ("eval", ["+calm=1"], "calm is now loss.static_flicker.weight"),
     ("report", ["++calm=1", "run=nowhere"], "calm is now loss.static_flicker.weight"),
     ("chart", ["~calm"], "calm is now loss.static_flicker.weight"),

@@ -23,6 +23,7 @@ from src.models.e2vid import E2VID
 from src.models.setnet import SetNet
 from src.sim.optics import layout
 from src.sim.voxel import voxel_grid
+from tests.conftest import default_dtype
 
 EXACT, ROUNDED = 1e-5, 0.02  # in grey levels: sums in another order, and bf16
 NETWORKS = {
@@ -169,6 +170,20 @@ def test_times_too_coarse_for_the_window_are_told_of():
     late["t"] = late["t"].clip(late["t0"], late["t1"]).astype(np.float32)
     with pytest.warns(UserWarning, match="t is float32, in steps of 0.000244141 s at 3600 s"):
         runtime(network("e2vid")).step(**events(0) | late)
+
+
+def test_off_events_of_weight_0_are_told_of_once():
+    window, live = events(0), runtime(network("e2vid"))
+    on = (window["p"] > 0).astype(np.float64)
+    with pytest.warns(UserWarning, match="p is 0 and 1 as floats, so that OFF .*: 2 . p - 1 gives"):
+        live.step(**window | {"p": on})
+    for weights in (on, np.ones_like(on), 0.5 * on, 2 * on - 1):
+        with warnings.catch_warnings(action="error"):
+            live.step(**window | {"p": weights})
+            live.reset()
+    with warnings.catch_warnings(action="error"):
+        for weights in (np.ones_like(on), np.zeros_like(on), 0.5 * on, 2 * on - 1):
+            runtime(network("e2vid")).step(**window | {"p": weights})
 
 
 @pytest.mark.parametrize("name", ["setnet", "e2vid"])
@@ -353,6 +368,16 @@ def test_frames_of_the_shortest_and_the_longest_window_are_finite(length_s):
     with warnings.catch_warnings(action="ignore"):
         assert np.isfinite(live.step(**window | long)).all()
     assert np.isfinite(live.step(**events(1))).all()
+
+
+@pytest.mark.parametrize("kind", ["float32", pytest.param("openvino", marks=OPENVINO)])
+@pytest.mark.parametrize("name", ["setnet", "e2vid"])
+def test_the_default_type_of_tensors_changes_nothing(name, kind, unchecked):
+    net = network(name)
+    found = [runtime(net, kind).step(**events(0))]
+    with default_dtype(torch.float64):
+        found.append(runtime(net, kind).step(**events(0)))
+    np.testing.assert_array_equal(*found)
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.float64])

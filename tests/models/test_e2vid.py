@@ -1,6 +1,7 @@
 """E2VID: published sizes, any frame size, pure state, spectral norm, learning."""
 
 import inspect
+import math
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from torch.nn.utils import parametrize
 from src.deploy.cost import macs_per_frame
 from src.models.e2vid import E2VID
 from src.models.network import check_voxel_shape, unroll
+from src.sim.optics import layout
 
 
 @pytest.mark.parametrize(
@@ -117,8 +119,42 @@ def test_views_are_stacked_view_by_view():
 
 @pytest.mark.parametrize("shape", [(1, 1, 3, 16, 16), (1, 2, 5, 16, 16)])
 def test_other_views_or_bins_are_refused(shape):
-    with pytest.raises(ValueError, match=r"optics.views, bins must be \(2, 3\)"):
+    with pytest.raises(ValueError, match=r"^views, bins must be \(2, 3\) .*optics.views, bins"):
         small()(torch.zeros(shape), None)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"positions": layout(2)[::-1]}, r"^positions must be arranged as \[\(0, 0\), \(0, 1\)\]"),
+        ({"positions": [(7, 7)] * 3}, r"^positions must be 2 \(row, col\) for this network, got 3"),
+        ({"window_s": -1.0}, "^window_s must be > 0 seconds, got -1.0"),
+        ({"window_s": math.nan}, "^window_s must be > 0 seconds, got nan"),
+        ({"window_s": torch.tensor([0.1, 0.0])}, "^window_s must be > 0 seconds, got .*0.0"),
+    ],
+)
+def test_positions_and_windows_that_do_not_fit_are_refused(options, message):
+    network, windows = small(), voxels()
+    for call in (network, network.warm_up):
+        with pytest.raises(ValueError, match=message):
+            call(windows[:, 0], None, **options)
+    with pytest.raises(ValueError, match=message):
+        network.sequence(windows, **options)
+
+
+@torch.no_grad()
+def test_positions_of_any_spacing_and_length_of_window_change_nothing():
+    network, window = small(), voxels()[:, 0]
+    frame, _ = network(window, window_s=0.3, positions=[(2, -3), (2, 5)])
+    assert torch.equal(frame, network(window)[0])
+
+
+@pytest.mark.parametrize("kind", [torch.float64, torch.int64, torch.bfloat16])
+@torch.no_grad()
+def test_grids_of_any_number_type_are_taken(kind):
+    network, window = small(), (3 * voxels()[:, 0]).round()
+    forward = inspect.unwrap(E2VID.forward)  # without the type checks of tests
+    assert torch.equal(forward(network, window.to(kind))[0], network(window)[0])
 
 
 def test_another_shape_is_refused_in_one_line():

@@ -45,6 +45,19 @@ def test_a_training_checkpoint_loads_exactly(tmp_path):
     assert torch.allclose(unroll(load(path), voxels())[0], unroll(network, voxels())[0], atol=1e-6)
 
 
+@pytest.mark.parametrize("name", ["net.safetensors", "last.ckpt"])
+def test_loading_leaves_the_random_numbers_as_they_are(tmp_path, name):
+    network, path = trained(), tmp_path / name
+    if path.suffix == ".ckpt":
+        state = {f"network.{name}": value for name, value in network.state_dict().items()}
+        torch.save({"network": SPEC, "state_dict": state}, path)
+    else:
+        save(path, network, SPEC, {})
+    before = torch.get_rng_state()
+    load(path)
+    assert torch.equal(torch.get_rng_state(), before)
+
+
 def test_a_word_names_shipped_weights(tmp_path, monkeypatch):
     monkeypatch.setattr(files, "WEIGHTS", tmp_path)
     save(tmp_path / "mine.safetensors", trained(), SPEC, {})

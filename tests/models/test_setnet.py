@@ -29,7 +29,7 @@ from src.models.setnet import SIZES, SetNet
 from src.models.setnet_state import SetNetState
 from src.models.time_gated_memory import TimeGatedMemory
 from src.sim.optics import layout
-from tests.conftest import ROOT
+from tests.conftest import ROOT, default_dtype
 from tests.test_train import config
 
 FULL = {"bins": 5, "refine_fusion": False, "gate_rank": None}  # with what SIZES says
@@ -449,6 +449,7 @@ def test_the_file_gives_the_network_back(tmp_path):
         ((1, 26, 3, 16, 16), {}, "views must be in 1..25"),
         ((1, 7, 3, 16, 16), {}, "views must be 1, 2"),
         ((1, 9, 3, 16, 16), {"positions": [(0, 0)]}, "positions must be 9"),
+        ((0, 9, 3, 16, 16), {}, "voxels must hold one clip and one window or more"),
         ((1, 9, 3, 16, 16), {"window_s": 0.0}, "window_s must be > 0"),
         ((2, 9, 3, 16, 16), {"window_s": torch.tensor([0.1, 0.0])}, "window_s must be > 0"),
         ((1, 9, 3, 16, 16), {"window_s": torch.tensor([math.nan])}, "window_s must be > 0"),
@@ -458,6 +459,15 @@ def test_the_file_gives_the_network_back(tmp_path):
 def test_bad_input_names_its_key(shape, options, message):
     with pytest.raises(ValueError, match=message):
         small()(torch.zeros(shape), None, **options)
+
+
+@pytest.mark.parametrize("window_s", [1 / 120, torch.tensor([0.01])])
+@torch.no_grad()
+def test_the_default_type_of_tensors_changes_nothing(window_s):
+    network, windows = small().eval(), voxels()[:1]
+    frames, _ = network.sequence(windows, window_s=window_s)
+    with default_dtype(torch.float64):
+        assert torch.equal(network.sequence(windows, window_s=window_s)[0], frames)
 
 
 def test_another_shape_is_refused_in_one_line():

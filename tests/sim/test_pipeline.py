@@ -238,3 +238,21 @@ def test_a_lamp_flickers_in_the_light_and_not_in_the_truth(half, crop):
     assert torch.allclose(dimmed[:, 1::2], torch.tensor(1.0))
     assert torch.equal(lit.voxels[..., side:], plain.voxels[..., side:])
     assert (lit.voxels[:, 0, ..., :side].sum(2) <= -1).all()  # 0.51 nat down, a threshold of 0.2
+
+
+def test_a_clip_is_recorded_with_the_temporal_model_that_it_is_simulated_with():
+    mixed, *single = (
+        pipeline(SimulatedTurbulence({"severity": "weak"}, temporal_model=model), optics=Optics(1))
+        for model in ("mixed", "ar1", "frozen_flow")
+    )
+    samples = [simulate(chain, range(6)) for chain in (mixed, *single)]
+    models = set()
+    for ours, *others in zip(*(sample.parameters for sample in samples), strict=True):
+        model, at = ours["temporal_model"], ours["clip"]
+        models.add(model)
+        seen, *own = (sample.voxels[at] for sample in samples)
+        assert torch.equal(seen, own[model == "frozen_flow"])
+        assert not torch.equal(seen, own[model == "ar1"])
+        assert ours == others[model == "frozen_flow"]
+        assert (ours["wind_m_s"] == 0) == (model == "ar1")
+    assert models == {"ar1", "frozen_flow"}

@@ -1,5 +1,6 @@
 """Voxel grids against E2VID's formula written out, the direct grids, and conservation of mass."""
 
+import inspect
 import math
 
 import numpy as np
@@ -149,7 +150,7 @@ def test_normalising_one_event_is_finite():
         ({"t1": 0}, "finite t0 < t1"),
         ({"t1": math.nan}, "t0 < t1"),
         ({"x": [1, 2]}, "one length"),
-        ({"bins": 0}, "must be positive"),
+        ({"bins": 0}, "bins, height, width must be whole numbers >= 1, got .0, 6, 7."),
         ({"t1": math.inf}, "finite t0 < t1"),
         ({"x": [1.5]}, "x and y must be whole numbers, got float64"),
     ],
@@ -158,6 +159,12 @@ def test_what_is_wrong_is_named(change, words):
     arguments = dict(t=[5], x=[1], y=[1], p=[1], t0=0, t1=10, **SIZE) | change
     with pytest.raises(ValueError, match=words):
         voxel_grid(**arguments)
+
+
+def test_a_number_of_bins_that_is_not_whole_is_named():
+    make = inspect.unwrap(voxel_grid)  # without the type checks of tests
+    with pytest.raises(ValueError, match=r"must be whole numbers >= 1, got \(5.0, 6, 7\)"):
+        make([5], [1], [1], [1], t0=0, t1=10, **SIZE | {"bins": 5.0})
 
 
 def test_no_events_are_an_empty_grid():

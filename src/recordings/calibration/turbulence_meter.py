@@ -39,7 +39,7 @@ FILM_OVER_DECAY = 8.0  # a decay that is more than the film over this is known b
 LEFT_OF_SLOW = 1 - 2 / math.e
 # Errors of the method at 95 %, of the logarithm, added to the intervals, from clips of known
 # turbulence (scripts/check_turbulence_meter.py): windows average, random blur shifts corners.
-METHOD_ERROR = {"rms_px": 0.15, "half_length_px": 0.3, "blur_px": 0.5}
+METHOD_ERROR = {"tilt_rms_px": 0.15, "tilt_correlation_half_length_px": 0.3, "blur_px": 0.5}
 
 
 @dataclass(frozen=True)
@@ -279,9 +279,10 @@ def _summarize_tilt(
     its rms is bounded by that of a decay as long as the film.
     """
     lengths = [one.half_length_px * unit for one in drawn]
-    half = _estimate("half_length_px", tilt.half_length_px * unit, lengths, most=float(SIDE))
+    length = tilt.half_length_px * unit
+    half = _estimate("tilt_correlation_half_length_px", length, lengths, most=float(SIDE))
     spreads = [one.power_px2**0.5 * unit for one in drawn]
-    rms = _estimate("rms_px", tilt.power_px2**0.5 * unit, spreads)
+    rms = _estimate("tilt_rms_px", tilt.power_px2**0.5 * unit, spreads)
     longest = longest_decay_frames(frames)
     if tilt.decay_frames > longest:
         assert rms.high is not None, "an rms is bounded"
@@ -294,12 +295,13 @@ def _summarize_tilt(
         decay = IntervalEstimate(None, None, 1 / fps)
     else:
         times = [max(one.decay_frames, 0.5) / fps for one in drawn]
-        decay = _estimate("decay_s", tilt.decay_frames / fps, times, most=longest / fps)
+        time_s = tilt.decay_frames / fps
+        decay = _estimate("tilt_correlation_time_s", time_s, times, most=longest / fps)
     return {
-        "rms_px": rms,
-        "half_length_px": half,
-        "whole_share": _estimate("whole_share", tilt.whole_view_share, shares),
-        "decay_s": decay,
+        "tilt_rms_px": rms,
+        "tilt_correlation_half_length_px": half,
+        "global_tilt_share": _estimate("global_tilt_share", tilt.whole_view_share, shares),
+        "tilt_correlation_time_s": decay,
     }
 
 

@@ -22,13 +22,20 @@ from src.sim.turbulence.simulated import SimulatedTurbulence
 
 SIDE = 256  # pixels of the smaller side of the frame that lengths are stated for
 ALLOWED = {
-    "rms_px": (0.001, 30.0),
-    "half_length_px": (1.0, 2000.0),
-    "whole_share": (0.0, 1.0),
-    "decay_s": (0.00001, 60.0),
+    "tilt_rms_px": (0.001, 30.0),
+    "tilt_correlation_half_length_px": (1.0, 2000.0),
+    "global_tilt_share": (0.0, 1.0),
+    "tilt_correlation_time_s": (0.00001, 60.0),
     "blur_px": (0.001, 30.0),
 }
-MAY_BE_UNKNOWN = ("half_length_px", "decay_s")  # by a bound only, or not at all
+# Known by a bound only, or not at all.
+MAY_BE_UNKNOWN = ("tilt_correlation_half_length_px", "tilt_correlation_time_s")
+RENAMED = {  # keys of earlier files
+    "rms_px": "tilt_rms_px",
+    "half_length_px": "tilt_correlation_half_length_px",
+    "whole_share": "global_tilt_share",
+    "decay_s": "tilt_correlation_time_s",
+}
 MAX_DRAWS = 32  # of what a clip shows, until a camera shows it
 WIDENING = 4.0  # times: how far beyond a bound values are drawn whose other bound is not known
 
@@ -54,10 +61,10 @@ class TurbulenceFile:
     Raises ValueError for numbers outside ALLOWED and for intervals that do not hold their value.
     """
 
-    rms_px: IntervalEstimate
-    half_length_px: IntervalEstimate
-    whole_share: IntervalEstimate
-    decay_s: IntervalEstimate
+    tilt_rms_px: IntervalEstimate
+    tilt_correlation_half_length_px: IntervalEstimate
+    global_tilt_share: IntervalEstimate
+    tilt_correlation_time_s: IntervalEstimate
     blur_px: IntervalEstimate
 
     def __post_init__(self):
@@ -89,6 +96,9 @@ def read_turbulence_file(path: Path | str | None) -> TurbulenceFile:
         raise ValueError(wrong)
     try:
         content = safe_yaml.read(path)
+        if isinstance(content, dict) and (former := RENAMED.keys() & content):
+            renamed = ", ".join(f"{k} is now {new}" for k, new in RENAMED.items() if k in former)
+            raise ValueError(f"{renamed}; their values are the same")
         if not isinstance(content, dict) or set(content) != set(ALLOWED):
             got = sorted(map(str, content)) if isinstance(content, dict) else type(content).__name__
             raise ValueError(f"its keys must be {', '.join(ALLOWED)}, got {got}")
@@ -122,8 +132,8 @@ class MeasuredTurbulence(SimulatedTurbulence):
         cameras = dict(self.atmosphere)
         unknown = cameras.pop("tilt_correlation_time_s")
         self.cameras = cameras
-        self.lengths = _drawing_range(self.file.half_length_px, (5.0, 600.0))
-        self.decays = _drawing_range(self.file.decay_s, unknown)
+        self.lengths = _drawing_range(self.file.tilt_correlation_half_length_px, (5.0, 600.0))
+        self.decays = _drawing_range(self.file.tilt_correlation_time_s, unknown)
 
     def operator(
         self, drawn: Atmosphere | None, *, views: Sequence[Position], **frames: Any
@@ -138,12 +148,13 @@ class MeasuredTurbulence(SimulatedTurbulence):
         """Draw an atmosphere that shows what the file says; raises ValueError where none does."""
         for _ in range(MAX_DRAWS):
             u = torch.rand(5, generator=generator, dtype=torch.float64).tolist()
-            rms, blur, share = self.file.rms_px, self.file.blur_px, self.file.whole_share
-            length = log_uniform(u[0], self.lengths, "half_length_px")
+            rms, blur, share = self.file.tilt_rms_px, self.file.blur_px, self.file.global_tilt_share
+            length = log_uniform(u[0], self.lengths, "tilt_correlation_half_length_px")
+            time_s = log_uniform(u[1], self.decays, "tilt_correlation_time_s")
             seen = TargetImageStatistics(
                 tilt_correlation_half_length_px=float(length),
-                tilt_correlation_time_s=float(log_uniform(u[1], self.decays, "decay_s")),
-                tilt_px=float(log_uniform(u[2], _bounds(rms), "rms_px")),
+                tilt_correlation_time_s=float(time_s),
+                tilt_px=float(log_uniform(u[2], _bounds(rms), "tilt_rms_px")),
                 blur_px=float(np.interp(u[3], (0, 1), _bounds(blur))),
                 global_tilt_share=float(np.interp(u[4], (0, 1), _bounds(share))),
             )

@@ -126,7 +126,7 @@ def refuse_motion_of_video(seconds: float | None, speed_widths_per_s: float) -> 
     """Raise ValueError for the length or the motion of a photograph where there is a video."""
     if seconds is not None:
         way = "a video has start_s and end_s"
-        raise ValueError(f"seconds must be null but for a photograph, {way}; got {seconds}")
+        raise ValueError(f"seconds must be left out but for a photograph, {way}; got {seconds}")
     if speed_widths_per_s:
         only = "speed_widths_per_s must be 0 but for a photograph"
         raise ValueError(f"{only}, got {speed_widths_per_s}")
@@ -172,7 +172,7 @@ def clip_from_array(
     array = np.asarray(values)
     is_colour = array.ndim == 3 and array.shape[2] <= 4
     if array.ndim not in (2, 3) or is_colour or (array.ndim == 3 and len(array) < 2):
-        wanted = "(h, w), a photograph, or (frames, h, w), grey"
+        wanted = "(h, w), a photograph, or (frames, h, w), two frames or more, grey"
         raise ValueError(f"photo_or_video must be of shape {wanted}, got {array.shape}")
     if array.dtype != np.uint8 and not (
         array.dtype.kind == "f" and array.size and 0 <= array.min() <= array.max() <= 1

@@ -54,7 +54,7 @@ def render_views(
 def render_tilt(plans: Sequence[TilePlan], frames: int) -> Float[Tensor, "views frames xy=2 h w"]:
     """Return the displacement (x, y) in pixels in the plans' tiles, on the CPU."""
     views = len(plans[0].amplitudes) // frames
-    out, parts = _allocate_tiles(plans, torch.empty(0), views, frames, 2)
+    out, parts = _allocate_tiles(plans, torch.empty(0, dtype=torch.float32), views, frames, 2)
     for plan, part in zip(plans, parts, strict=True):
         tables, reach = plan.tables.to(torch.device("cpu")), plan.fidelity.psf_size_px // 2
         sum_tilt = _make_wave_sum(tables, "tilt", 0, on_cpu=True)

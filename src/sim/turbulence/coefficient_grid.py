@@ -62,7 +62,7 @@ class GridAxis:
     def interpolation_matrix(self) -> Float[Tensor, "count nodes"]:
         """Return the weight of every node in every pixel; rows sum to 1."""
         if self.pitch == 1:
-            return torch.eye(self.count)
+            return torch.eye(self.count, dtype=torch.float32)
         pixel = torch.arange(self.count) + self.offset_from_first_node_px
         cell = torch.div(pixel, self.pitch, rounding_mode="floor")
         t = (pixel - cell * self.pitch).double() / self.pitch
@@ -124,7 +124,7 @@ class WaveSum:
     ) -> Float[Tensor, "modes frames rows columns"]:
         """Return Re sum_m amplitude_m response_m exp(2 pi i f_m . x) at the nodes."""
         modes, rows, columns = self.shape
-        out = torch.empty(modes, len(amplitudes), rows, columns)
+        out = torch.empty(modes, len(amplitudes), rows, columns, dtype=torch.float32)
         drawn = torch.view_as_real(amplitudes.contiguous()).numpy()
         for order, (weights, waves, cos_y, sin_y), cos_x, sin_x in self.radial_orders:
             even, odd = split_even_odd(weights, drawn, waves, cos_y, sin_y)

@@ -36,6 +36,18 @@ class ClipTurbulence(Protocol):
         """Return the displacement that `degrade` gives its first clip."""
 
 
+def describe_clip_turbulence(
+    operator: ClipTurbulence, generator: Generator
+) -> dict[str, float | int | str]:
+    """Return what is recorded of the clip that `operator.degrade` draws from `generator`.
+
+    An operator whose clips differ has `clip_metadata`, a function of the generator; of others it is
+    their `metadata`.
+    """
+    of_clip = getattr(operator, "clip_metadata", None)
+    return dict(operator.metadata if of_clip is None else of_clip(generator))
+
+
 @runtime_checkable
 class TurbulenceModel(Protocol):
     """Where the turbulence of every clip comes from."""

@@ -104,7 +104,8 @@ class Turbulence:
     def tilt(self, frames: int, generator: Generator, *, crop: Crop | None = None) -> Tilt:
         window = crop or (0, 0, self.height, self.width)
         if self.is_identity:
-            return torch.zeros(len(self.positions), frames, 2, *window[2:])
+            shape = len(self.positions), frames, 2, *window[2:]
+            return torch.zeros(shape, dtype=torch.float32)
         return render_tilt(self.plan(frames, generator, window), frames)
 
     @torch.no_grad()
@@ -124,7 +125,8 @@ class Turbulence:
                 yield render_views(part.float(), own), render_tilt(own, len(part))
             else:
                 views = part.expand(len(self.positions), *part.shape)
-                yield views, torch.zeros(*views.shape[:2], 2, *window[2:])
+                tilt_shape = *views.shape[:2], 2, *window[2:]
+                yield views, torch.zeros(tilt_shape, dtype=torch.float32)
             first = stop
 
     def plan(

@@ -241,7 +241,8 @@ def _kronecker_sequence(key: int, count: int) -> Float[Tensor, "count 3"]:
     """
     shift = noise.uniform(key, torch.arange(3)).double()
     step = torch.tensor([1 / count, math.sqrt(3) - 1, (math.sqrt(5) - 1) / 2], dtype=torch.float64)
-    return (shift * torch.tensor([1 / count, 1, 1]) + torch.arange(count)[:, None] * step) % 1.0
+    stratum = torch.tensor([1 / count, 1, 1], dtype=torch.float32)
+    return (shift * stratum + torch.arange(count)[:, None] * step) % 1.0
 
 
 def _draw_kappa(u: Tensor, low: float, high: float) -> tuple[Tensor, Tensor]:

@@ -61,12 +61,15 @@ def test_rms_and_half_length_of_known_warps_are_found(half_px, rms_px, noise):
     push = fields(half_px / UNIT, rms_px / UNIT, 0.0, 20)
     found = turbulence_meter.measure_turbulence(film(push, noise), 50.0).found
     rms = push.std(0).mean() * UNIT * np.sqrt(20 / 19)
-    assert found.rms_px.value == pytest.approx(rms, rel=0.1)
-    assert found.half_length_px.value == pytest.approx(half_px, rel=0.2)
-    assert found.rms_px.low < 0.87 * found.rms_px.value  # what the method errs by counts too
-    assert found.rms_px.high > 1.15 * found.rms_px.value
-    assert found.half_length_px.low < half_px < found.half_length_px.high
-    assert found.decay_s.value is None and found.decay_s.high == 1 / 50  # new in every frame
+    assert found.tilt_rms_px.value == pytest.approx(rms, rel=0.1)
+    assert found.tilt_correlation_half_length_px.value == pytest.approx(half_px, rel=0.2)
+    # What the method errs by counts too.
+    assert found.tilt_rms_px.low < 0.87 * found.tilt_rms_px.value
+    assert found.tilt_rms_px.high > 1.15 * found.tilt_rms_px.value
+    half = found.tilt_correlation_half_length_px
+    assert half.low < half_px < half.high
+    time_s = found.tilt_correlation_time_s
+    assert time_s.value is None and time_s.high == 1 / 50  # new in every frame
 
 
 def test_tilt_of_many_pixels_of_a_large_frame_is_followed_in_a_smaller_one():
@@ -77,8 +80,10 @@ def test_tilt_of_many_pixels_of_a_large_frame_is_followed_in_a_smaller_one():
     ])  # fmt: skip
     found = turbulence_meter.measure_turbulence(large)
     assert found.picture.shape == (256, 256)
-    assert found.found.rms_px.value == pytest.approx(push.std(0).mean() * UNIT * 1.033, rel=0.1)
-    assert found.found.half_length_px.value == pytest.approx(8, rel=0.2)
+    assert found.found.tilt_rms_px.value == pytest.approx(
+        push.std(0).mean() * UNIT * 1.033, rel=0.1
+    )
+    assert found.found.tilt_correlation_half_length_px.value == pytest.approx(8, rel=0.2)
 
 
 def test_decay_and_the_share_of_the_whole_view_are_found():
@@ -91,17 +96,19 @@ def test_decay_and_the_share_of_the_whole_view_are_found():
     found = turbulence_meter.measure_turbulence(film(push), 100.0).found
     centred = push - push.mean(0)
     truth = (centred.mean((2, 3)) ** 2).mean() / (centred**2).mean()
-    assert found.whole_share.value == pytest.approx(truth, abs=0.06)
-    assert found.decay_s.value == pytest.approx(-0.01 / np.log(0.8), rel=0.3)
-    assert found.decay_s.low < found.decay_s.value < found.decay_s.high
+    assert found.global_tilt_share.value == pytest.approx(truth, abs=0.06)
+    time_s = found.tilt_correlation_time_s
+    assert time_s.value == pytest.approx(-0.01 / np.log(0.8), rel=0.3)
+    assert time_s.low < time_s.value < time_s.high
 
 
 def test_half_length_beyond_the_frame_is_a_bound():
     rng = np.random.default_rng(0)
     push = np.broadcast_to(rng.normal(0, 0.6, (16, 2, 1, 1)), (16, 2, SIDE, SIDE))
     found = turbulence_meter.measure_turbulence(film(push), 30.0).found
-    assert found.half_length_px.value is None and found.half_length_px.high is None
-    assert found.half_length_px.low > 100 and found.whole_share.value > 0.95
+    half = found.tilt_correlation_half_length_px
+    assert half.value is None and half.high is None
+    assert half.low > 100 and found.global_tilt_share.value > 0.95
 
 
 def blurred(ratio: float) -> np.ndarray:
@@ -193,7 +200,7 @@ def test_what_compression_adds_is_no_tilt(quality):
 
 def test_weak_tilt_in_noise_is_not_underestimated():
     push = fields(10 / UNIT, 0.12 / UNIT, 0.5, 40)
-    found = turbulence_meter.measure_turbulence(film(push, 0.03)).found.rms_px
+    found = turbulence_meter.measure_turbulence(film(push, 0.03)).found.tilt_rms_px
     assert found.value == pytest.approx(0.12, rel=0.3)
 
 
@@ -214,9 +221,10 @@ def test_drift_of_the_camera_is_taken_off(moved):
     inside = slice(12, -12)  # where corners are looked for
     way = np.hypot(*(slow[-1] - slow[0])[:, inside, inside]).max() * UNIT
     assert found.camera_drift_px == pytest.approx(way, rel=0.3)
-    assert found.found.rms_px.value == pytest.approx(alone.found.rms_px.value, rel=0.05)
-    assert found.found.whole_share.value < 0.1
-    assert found.found.decay_s.value == pytest.approx(alone.found.decay_s.value, rel=0.15)
+    assert found.found.tilt_rms_px.value == pytest.approx(alone.found.tilt_rms_px.value, rel=0.05)
+    assert found.found.global_tilt_share.value < 0.1
+    times = [one.found.tilt_correlation_time_s.value for one in (found, alone)]
+    assert times[0] == pytest.approx(times[1], rel=0.15)
 
 
 def test_drift_alone_is_no_tilt():
@@ -228,7 +236,7 @@ def test_turbulence_as_slow_as_the_film_is_known_by_bounds():
     push = fields(6, 0.4, np.exp(-1 / 30), 60)  # 1/e after half of the film
     found = turbulence_meter.measure_turbulence(film(push), 30.0)
     assert found.camera_drift_px == 0  # its trends differ from point to point
-    decay, rms = found.found.decay_s, found.found.rms_px
+    decay, rms = found.found.tilt_correlation_time_s, found.found.tilt_rms_px
     assert decay.value is None and decay.high is None and 0.1 < decay.low < 1.0
     assert rms.low < 0.4 * UNIT < rms.high  # a part goes with the mean
     assert rms.high > 1.6 * rms.value
@@ -278,13 +286,15 @@ def test_calibrate_writes_a_file_and_a_figure(folder, tmp_path):
     run, save = tmp_path / "run", tmp_path / "air.yaml"
     calibrate(config("calibrate", run, "task=air", f"video={folder}", f"save={save}"))
     found = read_turbulence_file(save)
-    assert found.decay_s == IntervalEstimate(None, None, None)  # pictures have no frame rate
+    # Pictures have no frame rate.
+    assert found.tilt_correlation_time_s == IntervalEstimate(None, None, None)
     assert save.read_text() == (run / "air.yaml").read_text()
     assert cv2.imread(str(run / "air.png")).std() > 10
     again = config("calibrate", run, "task=air", f"video={folder}", "fps=50.0")
     timed = measure_turbulence_in_video(again, run)
-    assert timed.found.decay_s.value == pytest.approx(timed.tilt.decay_frames / 50)
-    assert timed.found.rms_px.value == pytest.approx(found.rms_px.value, rel=1e-3)
+    time_s = timed.found.tilt_correlation_time_s.value
+    assert time_s == pytest.approx(timed.tilt.decay_frames / 50)
+    assert timed.found.tilt_rms_px.value == pytest.approx(found.tilt_rms_px.value, rel=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -309,8 +319,9 @@ def test_footage_of_a_building_and_of_a_panning_camera(shared_data):
     found = turbulence_meter.measure_turbulence(
         _frames(shared_data / "turbulence/building")[:20]
     ).found
-    assert 0.6 < found.rms_px.value < 0.95 and 5 < found.half_length_px.value < 20
-    assert 0.1 < found.whole_share.value < 0.45
+    assert 0.6 < found.tilt_rms_px.value < 0.95
+    assert 5 < found.tilt_correlation_half_length_px.value < 20
+    assert 0.1 < found.global_tilt_share.value < 0.45
     with pytest.raises(ValueError, match="stands still"):
         turbulence_meter.measure_turbulence(
             _frames(shared_data / "turbulence/TSR_phys_0212.mp4")[::5]

@@ -19,10 +19,10 @@ from src.sim.turbulence.simulated import SimulatedTurbulence
 from tests.test_train import config
 
 SITE = {
-    "rms_px": [0.5, 0.4, 0.6],
-    "half_length_px": [15.0, 12.0, 18.0],
-    "whole_share": [0.1, 0.05, 0.15],
-    "decay_s": [0.05, 0.04, 0.06],
+    "tilt_rms_px": [0.5, 0.4, 0.6],
+    "tilt_correlation_half_length_px": [15.0, 12.0, 18.0],
+    "global_tilt_share": [0.1, 0.05, 0.15],
+    "tilt_correlation_time_s": [0.05, 0.04, 0.06],
     "blur_px": [0.4, 0.25, 0.65],
 }
 RANGES = {"tilt_correlation_time_s": (0.1, 0.2)}
@@ -43,7 +43,9 @@ def test_a_file_is_read_as_it_was_written(tmp_path):
     written = TurbulenceFile(**{key: IntervalEstimate(*row) for key, row in SITE.items()})
     (tmp_path / "air.yaml").write_text(written.to_yaml())
     assert read_turbulence_file(tmp_path / "air.yaml") == written
-    bound = TurbulenceFile(**vars(written) | {"decay_s": IntervalEstimate(None, None, 0.04)})
+    bound = TurbulenceFile(
+        **vars(written) | {"tilt_correlation_time_s": IntervalEstimate(None, None, 0.04)}
+    )
     (tmp_path / "air.yaml").write_text(bound.to_yaml())
     assert read_turbulence_file(tmp_path / "air.yaml") == bound
 
@@ -51,19 +53,35 @@ def test_a_file_is_read_as_it_was_written(tmp_path):
 @pytest.mark.parametrize(
     "changes, message",
     [
-        ({"rms_px": [-1.0, 0.1, 0.2]}, "rms_px must be in 0.001..30, got -1.0"),
-        ({"rms_px": [None, None, None]}, "rms_px must be in .* got None"),
-        ({"rms_px": [0.5, 0.6, 0.7]}, "rms_px must lie in its interval"),
-        ({"half_length_px": [15.0, 0.1, 20.0]}, "half_length_px must be in 1..2000, got 0.1"),
-        ({"whole_share": [0.5, 0.2, 1.5]}, "whole_share must be in 0..1, got 1.5"),
-        ({"decay_s": [float("nan"), 0.0, 1.0]}, "decay_s must be in"),
-        ({"decay_s": ["fast", 0.1, 1.0]}, "decay_s must hold numbers, got fast"),
+        ({"tilt_rms_px": [-1.0, 0.1, 0.2]}, "tilt_rms_px must be in 0.001..30, got -1.0"),
+        ({"tilt_rms_px": [None, None, None]}, "tilt_rms_px must be in .* got None"),
+        ({"tilt_rms_px": [0.5, 0.6, 0.7]}, "tilt_rms_px must lie in its interval"),
+        (
+            {"tilt_correlation_half_length_px": [15.0, 0.1, 20.0]},
+            "tilt_correlation_half_length_px must be in 1..2000, got 0.1",
+        ),
+        ({"global_tilt_share": [0.5, 0.2, 1.5]}, "global_tilt_share must be in 0..1, got 1.5"),
+        (
+            {"tilt_correlation_time_s": [float("nan"), 0.0, 1.0]},
+            "tilt_correlation_time_s must be in",
+        ),
+        (
+            {"tilt_correlation_time_s": ["fast", 0.1, 1.0]},
+            "tilt_correlation_time_s must hold numbers, got fast",
+        ),
         ({"blur_px": [1.2, 0.0, 1.3]}, "blur_px must be in 0.001..30, got 0.0"),
         ({"blur_px": [True, 1.0, 1.3]}, "blur_px must hold numbers, got True"),
-        ({"decay_s": None}, "its keys must be rms_px, half_length_px"),
+        (
+            {"tilt_correlation_time_s": None},
+            "its keys must be tilt_rms_px, tilt_correlation_half_length_px",
+        ),
         ({"more": [1, 1, 1]}, "its keys must be"),
-        ({"rms_px": 0.5}, "rms_px must hold value and interval"),
-        ({"rms_px": [0.5, 0.4]}, "rms_px must hold value and interval"),
+        (
+            {"decay_s": [1, 1, 1], "rms_px": [1, 1, 1], "tilt_rms_px": None},
+            "rms_px is now tilt_rms_px, decay_s is now tilt_correlation_time_s; their values are",
+        ),
+        ({"tilt_rms_px": 0.5}, "tilt_rms_px must hold value and interval"),
+        ({"tilt_rms_px": [0.5, 0.4]}, "tilt_rms_px must hold value and interval"),
     ],
 )
 def test_a_file_with_wrong_values_is_refused(changes, message, tmp_path):
@@ -110,7 +128,11 @@ def test_clips_show_what_the_file_says(tmp_path):
 
 @pytest.mark.parametrize("size", [(256, 256), (144, 256), (288, 512), (512, 288)])
 def test_lengths_are_of_a_frame_whose_smaller_side_is_256(size, tmp_path):
-    exact = {"rms_px": [0.5] * 3, "half_length_px": [15.0] * 3, "whole_share": [0.1, 0.0, 0.3]}
+    exact = {
+        "tilt_rms_px": [0.5] * 3,
+        "tilt_correlation_half_length_px": [15.0] * 3,
+        "global_tilt_share": [0.1, 0.0, 0.3],
+    }
     air = MeasuredTurbulence(site(tmp_path / "air.yaml", **exact), RANGES)
     height, width = size
     given = {"views": [(0, 0)], "height": height, "width": width, "fps": 120.0}
@@ -121,13 +143,13 @@ def test_lengths_are_of_a_frame_whose_smaller_side_is_256(size, tmp_path):
 
 
 def test_what_the_file_does_not_know_is_drawn_from_the_ranges(tmp_path):
-    unknown = site(tmp_path / "air.yaml", decay_s=[None, None, None])
+    unknown = site(tmp_path / "air.yaml", tilt_correlation_time_s=[None, None, None])
     decays = [
         -1 / (120 * np.log(path.ar1_coefficient))
         for path in draws(MeasuredTurbulence(unknown, RANGES))
     ]
     assert min(decays) > 0.099 and max(decays) < 0.201
-    bound = site(tmp_path / "air.yaml", half_length_px=[None, 120.0, None])
+    bound = site(tmp_path / "air.yaml", tilt_correlation_half_length_px=[None, 120.0, None])
     lengths = [
         path.tilt_correlation_half_length_px(256)
         for path in draws(MeasuredTurbulence(bound, RANGES), 10)
@@ -162,5 +184,5 @@ def test_another_measurement_makes_another_cache(tmp_path):
     chosen = ["turbulence=measured", f"turbulence.measured={path}", "data.cache_clips=2"]
     cfg = config("train", tmp_path, *chosen, f"data.cache_root={tmp_path}/cache")
     first = simulation.build_clip_cache(cfg).folder
-    site(tmp_path / "air.yaml", rms_px=[0.7, 0.6, 0.8])
+    site(tmp_path / "air.yaml", tilt_rms_px=[0.7, 0.6, 0.8])
     assert simulation.build_clip_cache(cfg).folder != first

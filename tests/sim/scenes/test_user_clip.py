@@ -85,6 +85,8 @@ def test_a_part_of_an_array_is_that_of_a_video():
             user_clip.clip_from_array(frames, fps=120.0, **{only: value})
     with pytest.raises(ValueError, match="grey"):
         user_clip.clip_from_array(np.zeros((48, 64, 3), np.uint8), fps=60.0)
+    with pytest.raises(ValueError, match=r"two frames or more, grey, got \(1, 48, 64\)$"):
+        user_clip.clip_from_array(frames[:1], fps=60.0)
 
 
 def test_arrays_are_clips(tmp_path):

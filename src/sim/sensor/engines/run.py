@@ -50,5 +50,5 @@ def zeros(shape: Sequence[int], device: torch.device) -> Tensor:
     until something else is written.
     """
     if device.type != "cpu":
-        return torch.zeros(*shape, device=device)
+        return torch.zeros(*shape, dtype=torch.float32, device=device)
     return torch.from_numpy(np.zeros(tuple(shape), np.float32))
