@@ -59,8 +59,8 @@ class MambaTM(FramePostprocessor):
         self.encoder = FrameEncoder((1 + stabilise_input) * frame_channels, base_channels)
         self.distortion_encoder = FrameEncoder(DISTORTION, base_channels)
         self.distortion_width = nn.Conv2d(width, width, 1)
-        self.distortion_decoder = FrameDecoder(DISTORTION, base_channels)
-        self.decoder = FrameDecoder(frame_channels, base_channels)
+        self.distortion_decoder = RestorationDecoder(DISTORTION, base_channels)
+        self.decoder = RestorationDecoder(frame_channels, base_channels)
         for parameter in self.decoder.out[-1].parameters():
             nn.init.zeros_(parameter)  # what is added to the input begins with nothing
         if stabilise_input:
@@ -183,7 +183,7 @@ class DenseBlock(nn.Module):
         return x + self.back(seen)
 
 
-class FrameDecoder(nn.Module):
+class RestorationDecoder(nn.Module):
     """From 1/8 back to full resolution, fused at each scale with what the encoder saw."""
 
     def __init__(self, channels: int, features: int):
@@ -225,7 +225,7 @@ class ChannelAttentionBlock(nn.Module):
         return x + weights * outcome
 
 
-def _decode(decoder: FrameDecoder, deep: Tensor, skips: list[Tensor], limit: int) -> Tensor:
+def _decode(decoder: RestorationDecoder, deep: Tensor, skips: list[Tensor], limit: int) -> Tensor:
     parts = zip(*(maps.split(limit) for maps in (deep, *skips)), strict=True)
     return torch.cat([decoder(x, seen) for x, *seen in parts])
 

@@ -69,7 +69,7 @@ def write_pack(
     if not SIDES[0] <= side <= SIDES[1]:
         raise ValueError(f"side must be in {SIDES[0]}..{SIDES[1]} (px), got {side}")
     sources = read_photographs(folders, train_only, side)
-    quality, content = encode_within(sources, mib)
+    quality, content = encode_within_mib(sources, mib)
     with atomic_path(out) as partial:
         partial.write_bytes(content)
     counts = [sum(source.split == split for source in sources) for split in SPLITS]
@@ -97,7 +97,7 @@ def read_photographs(
         return [GreyPhotograph(_name(path, roots), split, grey) for (path, split), grey in pairs]
 
 
-def encode_within(sources: Sequence[GreyPhotograph], mib: float) -> tuple[int, bytes]:
+def encode_within_mib(sources: Sequence[GreyPhotograph], mib: float) -> tuple[int, bytes]:
     """Return the best quality with which the pack is at most `mib` MiB, and the pack.
 
     Raises ValueError, with what the worst quality would need, where there is none.

@@ -68,7 +68,7 @@ def ship(run: Path, name: str, tests: list[Path], given: Given | None = None) ->
     return _write_card(path, name, network, card, tests)
 
 
-def recard(name: str, tests: list[Path]) -> Path:
+def rewrite_card(name: str, tests: list[Path]) -> Path:
     """Write the card of shipped weights anew, with what `tests` hold; its sections, written by
     hand, stay.  Returns the weights' path."""
     path = files.WEIGHTS / f"{name}.safetensors"
@@ -234,7 +234,7 @@ def main() -> None:
     arguments = parser.parse_args()
     shipped = files.WEIGHTS / f"{arguments.run}.safetensors"
     if shipped.is_file() and not arguments.run.is_dir():
-        print(recard(str(arguments.run), arguments.test))
+        print(rewrite_card(str(arguments.run), arguments.test))
         return
     name = arguments.name or first_config(arguments.run).name
     given = Given(arguments.recipe, arguments.weights, arguments.to)

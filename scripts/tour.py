@@ -23,7 +23,7 @@ OUT = HOME / "docs" / "figures" / "tour"
 SIDE, WINDOWS, PITCH = 192, 40, 24  # pixels of a frame; length of the clip; pixels between stars
 
 
-def colours(grey: np.ndarray) -> np.ndarray:
+def grey_to_rgb(grey: np.ndarray) -> np.ndarray:
     """Return (..., h, w) in [0, 1] as (..., h, w, 3)."""
     return np.repeat(grey[..., None], 3, -1)
 
@@ -84,13 +84,13 @@ def draw_all(index: int) -> None:
     )
     reach = float(tilt.abs().max())
 
-    save("1_scene", {"first frame": colours(truth[0]), "last frame": colours(truth[-1])})
+    save("1_scene", {"first frame": grey_to_rgb(truth[0]), "last frame": grey_to_rgb(truth[-1])})
     right, down = render_events(tilt[centre].numpy(), full=reach)
     save("2_tilt", {f"tilt in x, to {reach:.1f} px": right, "tilt in y": down})
-    first, second = map(colours, stars(pipeline, draw)[:, :96, :96])
+    first, second = map(grey_to_rgb, stars(pipeline, draw)[:, :96, :96])
     save("3_psfs", {"points through one view": first, "through its neighbour": second}, scale=4)
     grid = place_views_at_apertures(
-        [colours(view[-1:].numpy()) for view in views], pipeline.optics
+        [grey_to_rgb(view[-1:].numpy()) for view in views], pipeline.optics
     )[0]
     save("4_views", {"what the nine views see": grid}, scale=1)
     save("5_sensor", {"events of 1/30 s on one sensor": chip(pipeline, draw, views)}, scale=1)
@@ -101,11 +101,12 @@ def draw_all(index: int) -> None:
     )
     bins = render_events(voxels[centre].numpy(), full=1.5)
     save("7_voxels", {f"bin {k}": outline(part[32:160, 32:160]) for k, part in enumerate(bins)})
-    last = {"ground truth": colours(truth[-1])}
-    save("8_one_view", {"one view, reconstructed": colours(one[-1])} | last)
-    save("9_nine_views", {"nine views, reconstructed": colours(nine[-1])} | last)
+    last = {"ground truth": grey_to_rgb(truth[-1])}
+    save("8_one_view", {"one view, reconstructed": grey_to_rgb(one[-1])} | last)
+    save("9_nine_views", {"nine views, reconstructed": grey_to_rgb(nine[-1])} | last)
     films = {"the view": seen, "one view": one, "nine views": nine, "ground truth": truth}
-    save("10_slices", {name: colours(film[:, middle].repeat(3, 0)) for name, film in films.items()})
+    stretched = {name: film[:, middle].repeat(3, 0) for name, film in films.items()}
+    save("10_slices", {name: grey_to_rgb(film) for name, film in stretched.items()})
 
 
 def main() -> None:

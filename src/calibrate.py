@@ -91,7 +91,7 @@ def _find_views_of_board(cfg: DictConfig, run: Path, target: Target) -> Views:
         views = view_alignment.views_from_corners(corners, **sizes)
         calibration_figures.draw_views(picture, views, run / "views.png")
         return views
-    found = view_alignment.find_target(picture, target, cfg.mirrors)
+    found = view_alignment.find_target_in_views(picture, target, cfg.mirrors)
     calibration_figures.draw_found_target(picture, found, run / "found.png")
     aligned = view_alignment.fit_homographies(found, **sizes)
     calibration_figures.draw_view_residuals(picture, aligned, run / "views.png")

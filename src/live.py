@@ -22,7 +22,7 @@ from src.live_view.live_windows import WindowCutter, WindowQueue
 from src.live_view.network_runner import Controls, RunSettings
 from src.live_view.page_server import THIS_MACHINE, LivePage, PageServer, find_page_address
 from src.live_view.player import Player
-from src.live_view.status import FaultLog, Meters
+from src.live_view.status import FaultLog, PipelineCounters
 from src.models.network import EventToVideoNetwork
 from src.recordings.files.event_file import ReadOptions
 from src.recordings.noise_filter import NoiseFilter
@@ -111,7 +111,7 @@ def assemble_server(
         views.sensor, settings.fps, faults, is_live=feed.is_live, noise_filter=noise_filter
     )
     waiting = WindowQueue(max_waiting_windows, lossless=playback_speed == float("inf"))
-    reader = FeedReader(feed, cutter, waiting, counter, clock, Meters(), faults)
+    reader = FeedReader(feed, cutter, waiting, counter, clock, PipelineCounters(), faults)
     player = Player(reader, Controls(networks, views, settings), FrameRing(views.model))
     player.set_tone(tone, tone_time_constant_s)
     return PageServer(LivePage(player, views.positions), host, port, allowed_origins)

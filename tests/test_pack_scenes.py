@@ -76,7 +76,7 @@ def test_the_quality_is_the_best_that_fits(folders, tmp_path):
     sizes = [len(pack_scenes.build_pack(pack_scenes._encode(sources, q))) for q in (40, 41)]
     assert sizes[0] < sizes[1]
     for size in sizes:
-        quality, content = pack_scenes.encode_within(sources, size / MIB)
+        quality, content = pack_scenes.encode_within_mib(sources, size / MIB)
         assert len(content) <= size and (quality == 40) == (size == sizes[0])
     tight = write_pack(folders, tmp_path / "tight.pack", side=64, mib=sizes[0] / MIB)
     assert "quality 40," in tight and (tmp_path / "tight.pack").stat().st_size == sizes[0]

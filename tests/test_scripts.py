@@ -9,7 +9,7 @@ import torch
 
 from scripts import gallery, pretrain_context, readme, ship_weights, turbulence_map, widen_setnet
 from scripts.error_by_detail_size import missing
-from scripts.ship_weights import CARD_NOTE, Given, recard, ship
+from scripts.ship_weights import CARD_NOTE, Given, rewrite_card, ship
 from src.app import build
 from src.metrics.table import METRICS
 from src.models import files
@@ -66,7 +66,7 @@ def test_a_trained_run_is_shipped_whole_with_its_card(tmp_path, monkeypatch, cle
     assert "| started_from | one.safetensors |" in gone_on
     whole, by_hand = path.read_bytes(), "\n## A section\n\nWritten by hand.\n"
     path.with_suffix(".md").write_text(card + by_hand)
-    assert recard("tiny/one", [run, run]) == path and path.read_bytes() == whole
+    assert rewrite_card("tiny/one", [run, run]) == path and path.read_bytes() == whole
     text = path.with_suffix(".md").read_text()
     anew = text.removesuffix(by_hand).splitlines()
     assert text.endswith(by_hand) and len(anew) == len(card.splitlines()) + 1

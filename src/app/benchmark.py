@@ -17,7 +17,7 @@ from baselines import published
 from baselines.centre_view import CentreViewNetwork
 from src.app import entry_point, methods
 from src.app.compose import CONF
-from src.app.hardware import first_gpu
+from src.app.hardware import first_requested_gpu
 from src.app.instantiate import as_dict, build_part
 from src.app.metrics import SHIPPED_METRIC_KEYS
 from src.metrics.table import Column
@@ -79,7 +79,8 @@ class EvrealBenchmark:
 
     def __init__(self, cfg: DictConfig):
         self.cfg, self.rule = cfg, _build_rule(cfg)
-        self.device = f"cuda:{first_gpu(cfg)}" if cfg.trainer.accelerator == "gpu" else "cpu"
+        on_gpu = cfg.trainer.accelerator == "gpu"
+        self.device = f"cuda:{first_requested_gpu(cfg)}" if on_gpu else "cpu"
         self.network = _load_network(cfg).to(self.device)
         if self.rule.output_normalisation != "none" and isinstance(self.network, CentreViewNetwork):
             self.network.output = self.network.output.replace("clip", "none")  # clipped after it

@@ -15,7 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor, nn
 
 from baselines.postprocess import Postprocessed
-from src.app.hardware import first_gpu, uses_cuda_graphs
+from src.app.hardware import first_requested_gpu, uses_cuda_graphs
 from src.app.instantiate import (
     as_dict,
     build_part,
@@ -257,7 +257,7 @@ def test_method(
     # On SLURM a trainer takes up what a preempted training left in its folder: this one has none.
     options: dict = {"precision": "32-true", "logger": False, "enable_checkpointing": False}
     options |= {"num_nodes": 1, "strategy": "auto", "default_root_dir": None}
-    options["devices"] = [first_gpu(cfg)] if cfg.trainer.accelerator == "gpu" else 1
+    options["devices"] = [first_requested_gpu(cfg)] if cfg.trainer.accelerator == "gpu" else 1
     callbacks = [TrainingProgress(tested=name)] if cfg.trainer.enable_progress_bar else []
     trainer = build_part(cfg, "trainer", callbacks=callbacks, **options)
     options = {"unscored_windows": cfg.data.unscored_windows, "kept_clips": kept_clips}

@@ -71,6 +71,6 @@ def requested_gpus(cfg: DictConfig) -> list[int]:
         raise ValueError(f"trainer.devices must be {wanted}, got {devices}: {why}") from error
 
 
-def first_gpu(cfg: DictConfig) -> int:
+def first_requested_gpu(cfg: DictConfig) -> int:
     """Return the number of the first GPU that `trainer.devices` asks for, on which tests run."""
     return next(iter(requested_gpus(cfg)), 0)

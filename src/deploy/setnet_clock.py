@@ -78,7 +78,7 @@ class SetNetClock:
         longest_s = self._advance(pixels, changed)
         smoothed, update = self._advance_context(longest_s, changed)
         kept = exp_float32(-longest_s / np.float32(CONTEXT_TAU_S))
-        tiles = (list_places(part) for part in (self.active_tiles, changed))
+        tiles = (list_nonzero_cells(part) for part in (self.active_tiles, changed))
         active_tiles, changed_tiles = tiles
         return Tick(active_tiles, update, *smoothed, kept, changed_tiles)
 
@@ -202,7 +202,7 @@ class EventMaps:
         sums_numba.add_to_mixtures(places, pixel_sums, self.code, state.mixtures)
 
 
-def list_places(mask: np.ndarray) -> Int[np.ndarray, "n 2"]:
+def list_nonzero_cells(mask: np.ndarray) -> Int[np.ndarray, "n 2"]:
     """Return (row, column) of what is not 0, in rows: numba compiles for one layout."""
     return np.ascontiguousarray(np.argwhere(mask), np.int32)
 

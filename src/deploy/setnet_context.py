@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from src.deploy.engines import tiles_numba
-from src.deploy.setnet_clock import ContextUpdate, list_places, max_of_squares
+from src.deploy.setnet_clock import ContextUpdate, list_nonzero_cells, max_of_squares
 from src.deploy.setnet_layers import channels_first, channels_last, unpadded
 from src.deploy.tile_batches import TileModule
 from src.models.context_pyramid import ContextPyramid
@@ -223,7 +223,7 @@ class ContextTiles:
 
 def find_tiles(mask: UInt8[np.ndarray, "_h _w"]) -> Int[np.ndarray, "n 2"]:
     """Return first row and column of the tiles of a scale that have a cell of `mask`."""
-    return np.int32(CONTEXT_TILE) * list_places(max_of_squares(mask, CONTEXT_TILE))
+    return np.int32(CONTEXT_TILE) * list_nonzero_cells(max_of_squares(mask, CONTEXT_TILE))
 
 
 @lru_cache(64)

@@ -17,13 +17,13 @@ Backend = Callable[[nn.Module, list[Tensor], int], Any]  # EagerBackend or Compi
 
 
 @lru_cache(4096)
-def split_into_batches(tiles: int, sizes: tuple[int, ...]) -> tuple[int, ...]:
+def choose_batch_sizes(tiles: int, sizes: tuple[int, ...]) -> tuple[int, ...]:
     """Return the sizes of the batches, of `sizes`, in which `tiles` take least time."""
     if tiles <= 0:
         return ()
     if tiles > 2 * sizes[-1]:
-        return sizes[-1], *split_into_batches(tiles - sizes[-1], sizes)
-    ways = [(size, *split_into_batches(tiles - size, sizes)) for size in sizes]
+        return sizes[-1], *choose_batch_sizes(tiles - sizes[-1], sizes)
+    ways = [(size, *choose_batch_sizes(tiles - size, sizes)) for size in sizes]
     return min(ways, key=lambda way: sum(way) + CALL_COST * len(way))
 
 
@@ -82,7 +82,7 @@ class TileModule:
         """Run on all `tiles`: read(which, inputs) fills the inputs of a batch, write(which, output)
         takes its output."""
         start = 0
-        for size in split_into_batches(tiles, self.sizes):
+        for size in choose_batch_sizes(tiles, self.sizes):
             part = slice(start, min(start + size, tiles))
             read(part, self.inputs[size])
             self.compiled[size].run(self.inputs[size], self.outputs[size])

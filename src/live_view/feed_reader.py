@@ -21,7 +21,7 @@ from src.live_view.live_windows import (
     WindowCutter,
     WindowQueue,
 )
-from src.live_view.status import FaultLog, Meters
+from src.live_view.status import FaultLog, PipelineCounters
 from src.recordings.event_windows import COVERED, describe_short_recording
 from src.recordings.files.event_arrays import concatenate_events
 from src.recordings.files.event_file import EVENT
@@ -147,7 +147,7 @@ class FeedReader:
         waiting: WindowQueue,
         counter: PolarityAccumulator,
         clock: PlaybackClock,
-        meters: Meters,
+        meters: PipelineCounters,
         faults: FaultLog,
     ):
         if feed.is_live and clock.speed != 1:

@@ -38,7 +38,7 @@ class FaultLog:
         return [f"{text} ({count:,} events)" if count else text for _, text, count in lines]
 
 
-class Meters:
+class PipelineCounters:
     """Counts of a running chain; `span_s`: the seconds that rates and latency are taken over."""
 
     def __init__(self, span_s: float = 2.0):

@@ -44,8 +44,8 @@ def open_video_writer(
 
     `size`: (height, width); `film`: frames with colours; `playback_fps`: of an MP4 or GIF,
     in [0.1, 1000], of a GIF up to 50.
-    `frames.csv` gets each frame's index, time in s, events in views and outside.  Raises ValueError
-    as `check_video_settings` does, or where the file cannot be written.
+    `frames.csv` gets each frame's index, time in s, events in views and outside of them.  Raises
+    ValueError as `check_video_settings` does, or where the file cannot be written.
     """
     check_video_settings(kind, folder, playback_fps)
     folder.mkdir(parents=True, exist_ok=True)
@@ -57,7 +57,7 @@ def open_video_writer(
         make(video, size, playback_fps) as add,
     ):
         table = csv.writer(file)
-        table.writerow(["frame", "time_s", "events", "outside"])
+        table.writerow(["frame", "time_s", "events", "events_outside_views"])
         frames = 0
 
         def write(frame: Frame) -> None:

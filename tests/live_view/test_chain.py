@@ -28,7 +28,7 @@ from src.live_view.live_windows import (
 )
 from src.live_view.network_runner import NetworkRunner, RunSettings
 from src.live_view.page_server import PageServer
-from src.live_view.status import FaultLog, Meters
+from src.live_view.status import FaultLog, PipelineCounters
 from src.models.setnet import SetNet
 from src.recordings import event_windows, reconstruction
 from src.recordings.files.event_file import EVENT
@@ -230,7 +230,7 @@ def live_windows(feed, seconds: float, faults: FaultLog):
     """Return the windows at 100 fps of `seconds` of a live feed, and the intake."""
     marks, meters, waiting = (
         PolarityAccumulator(build_lookup(scenes.views())),
-        Meters(),
+        PipelineCounters(),
         WindowQueue(10_000),
     )
     cutter = WindowCutter(scenes.SENSOR, 100.0, faults)
@@ -329,7 +329,8 @@ def cut_quiet(*chunks):
         PolarityAccumulator(build_lookup(scenes.views())),
         WindowCutter(scenes.SENSOR, 200.0, faults),
     )
-    intake = FeedReader(Script(), cutter, waiting, marks, PlaybackClock(1.0), Meters(), faults)
+    parts = waiting, marks, PlaybackClock(1.0), PipelineCounters(), faults
+    intake = FeedReader(Script(), cutter, *parts)
     for at, times, *x in chunks:
         made = np.zeros(len(times), EVENT)
         made["t"], made["x"], made["p"] = times, x[0] if x else 5, 1
@@ -391,7 +392,11 @@ def test_what_comes_live_is_not_slowed_down():
     parts = (WindowQueue(1), PolarityAccumulator(build_lookup(scenes.views())), PlaybackClock(0.5))
     with pytest.raises(ValueError, match="playback_speed must be 1 for what comes live"):
         FeedReader(
-            Script(), WindowCutter(scenes.SENSOR, 100.0, FaultLog()), *parts, Meters(), FaultLog()
+            Script(),
+            WindowCutter(scenes.SENSOR, 100.0, FaultLog()),
+            *parts,
+            PipelineCounters(),
+            FaultLog(),
         )
 
 

@@ -24,7 +24,7 @@ from src.live_view.live_windows import (
     WindowQueue,
 )
 from src.live_view.network_runner import offered_view_counts, positions_used
-from src.live_view.status import FaultLog, Meters
+from src.live_view.status import FaultLog, PipelineCounters
 from src.recordings.files.event_file import EVENT
 from src.recordings.files.event_order import BUFFER_US
 from src.recordings.sensor_lookup import build_lookup
@@ -347,7 +347,7 @@ def test_views_long_and_narrow_are_drawn(size):
 
 
 def test_meters_say_rates_and_latency_of_the_last_seconds():
-    meters = Meters(span_s=5.0)
+    meters = PipelineCounters(span_s=5.0)
     assert (
         meters.measure_rates_and_latency()["fps"] == 0
         and meters.measure_rates_and_latency()["latency_ms"]["median"] is None

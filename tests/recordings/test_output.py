@@ -80,7 +80,7 @@ def test_what_was_done_is_kept_when_the_run_fails(kind, tmp_path):
     with open(partial_path(tmp_path / "frames.csv")) as file:
         rows = list(csv.DictReader(file))
     assert [float(row["time_s"]) for row in rows] == [0, 0.25, 0.5]
-    assert rows[2]["events"] == "20" and rows[2]["outside"] == "2"
+    assert rows[2]["events"] == "20" and rows[2]["events_outside_views"] == "2"
 
 
 @pytest.mark.parametrize("fps", [50, 30, 24, 0.1])

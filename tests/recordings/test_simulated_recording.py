@@ -63,7 +63,7 @@ def test_a_blinking_screen_calibrates_the_views(truth, target, picture, tmp_path
     simulated_recording.write_recording(path, blinking(half(picture)), 60.0, truth, noisy_sensor())
     seen = view_alignment.repair_picture(recording_inputs.read_picture_or_event_counts(path))
     aligned = view_alignment.fit_homographies(
-        view_alignment.find_target(seen, target), sensor=SENSOR, model=(88, 88)
+        view_alignment.find_target_in_views(seen, target), sensor=SENSOR, model=(88, 88)
     )
     assert aligned.views.positions == list(layout(9))
     assert max(distance_px(aligned.views, truth).values()) < 0.3
@@ -80,7 +80,8 @@ def test_a_blinking_charuco_board_calibrates_the_views_of_an_evk4(tmp_path):
     events = simulated_recording.record_events(film, 60.0, truth, noisy_sensor())
     counts = np.zeros(truth.sensor)
     np.add.at(counts, (events["y"], events["x"]), 1)
-    found = view_alignment.find_target(view_alignment.repair_picture(counts), Charuco(6, 6))
+    picture = view_alignment.repair_picture(counts)
+    found = view_alignment.find_target_in_views(picture, Charuco(6, 6))
     with pytest.warns(UserWarning, match=r"points span little .*: view \(1, 1\) 5\d%; beyond"):
         aligned = view_alignment.fit_homographies(found, sensor=truth.sensor, model=(176, 176))
     away = distance_px(aligned.views, truth)

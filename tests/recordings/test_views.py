@@ -73,7 +73,7 @@ def distance_px(found: views.Views, truth: views.Views) -> dict:
 
 
 def calibrate(picture, target, **options):
-    found = view_alignment.find_target(picture, target, **options)
+    found = view_alignment.find_target_in_views(picture, target, **options)
     return view_alignment.fit_homographies(found, sensor=SENSOR, model=(176, 176)).views
 
 
@@ -114,7 +114,7 @@ def test_a_view_that_does_not_show_the_target_is_left_out(truth):
 
 def test_fewer_than_four_views_are_refused_but_reported(truth):
     target, picture = TARGETS["circles"]
-    found = view_alignment.find_target(shown(truth, picture, keep=[3, 4, 5]), target)
+    found = view_alignment.find_target_in_views(shown(truth, picture, keep=[3, 4, 5]), target)
     assert sorted(found) == [(0, -1), (0, 0), (0, 1)]
     with pytest.raises(ValueError, match="in 4 or more views .* got 3"):
         view_alignment.fit_homographies(found, sensor=SENSOR, model=(176, 176))
@@ -122,7 +122,7 @@ def test_fewer_than_four_views_are_refused_but_reported(truth):
 
 def test_a_picture_without_targets_shows_none():
     noise = np.random.default_rng(0).integers(0, 255, SENSOR).astype(np.uint8)
-    assert not view_alignment.find_target(noise, Circles(5, 7))
+    assert not view_alignment.find_target_in_views(noise, Circles(5, 7))
 
 
 def test_corners_by_hand_give_the_true_homographies(truth):

@@ -40,7 +40,7 @@ def repair_picture(counts: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"]
     return np.clip((repaired - low) / max(high - low, 1e-9) * 255, 0, 255).astype(np.uint8)
 
 
-def find_target(
+def find_target_in_views(
     picture: UInt8[np.ndarray, "h w"], target: Target, are_mirrored: bool = True
 ) -> dict[Position, Points]:
     """Return the points of `target` in each view of a sensor picture in which it is found, row by

@@ -96,7 +96,7 @@ def read_units_attribute(node: Any, options: ReadOptions) -> str | None:
 def find_time_unit_by_ms_to_idx(marks: h5py.Dataset, t: Any) -> str | None:
     """Return the unit of times (n,) whose first event of each millisecond is at `marks` (DSEC's
     ms_to_idx): the nearest, within a factor of three; else us of whole numbers, None of others."""
-    usual = "us" if has_integer_times(t) else None
+    usual = "us" if are_times_whole(t) else None
     if marks.ndim != 1 or marks.dtype.kind not in "iu":
         return None
     index = marks[:].astype(np.int64)
@@ -115,7 +115,7 @@ def find_time_unit_by_ms_to_idx(marks: h5py.Dataset, t: Any) -> str | None:
     return unit if off[unit] < 0.5 else usual
 
 
-def has_integer_times(t: Any) -> bool:
+def are_times_whole(t: Any) -> bool:
     """Return whether the first thousand times are whole numbers."""
     values = np.asarray(t[:1000])
     return np.array_equal(values, np.rint(values))

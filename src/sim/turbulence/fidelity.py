@@ -47,9 +47,9 @@ class Fidelity:
     `aperture_px`: D at the object; `tilt_px`: standard deviation along one axis; `blur_px`: blur
     beyond diffraction (Atmosphere.blur_px).  `zernike_modes` from tilt on; `psf_network`: the one
     that turns them into weights of `psf_rank` basis functions; `*_grid_pitch_px`: pixels between
-    the nodes of the phase.  `error_psf` (modes left out, network and basis), `error_grid`,
-    `error_kernel`: shares of the random power; `error`: the rms error they make together, of an
-    image's contrast.
+    the nodes of the phase.  `psf_error` (modes left out, network and basis), `psf_grid_error`,
+    `psf_size_error`: shares of the random power; `tilt_error_px`: of the tilt between nodes, rms;
+    `simulation_error`: the rms error that the first three make, of an image's contrast.
     """
 
     d_over_r0: float = 0.0
@@ -73,11 +73,11 @@ class Fidelity:
     psf_size_px: int = 1
     psf_grid_pitch_px: int = 1
     tilt_grid_pitch_px: int = 1
-    error_psf: float = 0.0
-    error_grid: float = 0.0
-    error_kernel: float = 0.0
-    error_tilt_px: float = 0.0
-    error: float = 0.0
+    psf_error: float = 0.0
+    psf_grid_error: float = 0.0
+    psf_size_error: float = 0.0
+    tilt_error_px: float = 0.0
+    simulation_error: float = 0.0
 
 
 def choose_fidelity(atmosphere: Atmosphere, width_px: int, max_error_share: float) -> Fidelity:
@@ -108,8 +108,10 @@ def choose_fidelity(atmosphere: Atmosphere, width_px: int, max_error_share: floa
         lambda_over_d_px=unit,
         blur_px=atmosphere.blur_px(width_px),
         tilt_grid_pitch_px=tilt_pitch,
-        error_tilt_px=error_tilt,
-        error=math.sqrt(power * (psf["error_psf"] + psf["error_grid"] + psf["error_kernel"])),
+        tilt_error_px=error_tilt,
+        simulation_error=math.sqrt(
+            power * (psf["psf_error"] + psf["psf_grid_error"] + psf["psf_size_error"])
+        ),
         **psf,
     )
 
@@ -182,8 +184,8 @@ def choose_psf_settings(
     at_nodes, between = float(psf[n, 0, r]), float(psf[n, p, r])
     return {
         "zernike_modes": band.networks[n].modes, "psf_network": n, "psf_rank": ranks[r],
-        "psf_grid_pitch_px": p + 1, "psf_size_px": sizes[k], "error_psf": at_nodes,
-        "error_grid": between - at_nodes, "error_kernel": float(kernel[k]),
+        "psf_grid_pitch_px": p + 1, "psf_size_px": sizes[k], "psf_error": at_nodes,
+        "psf_grid_error": between - at_nodes, "psf_size_error": float(kernel[k]),
     }  # fmt: skip
 
 

@@ -19,7 +19,7 @@ def show_boards(rows: int, cols: int) -> np.ndarray:
 
 
 def find_turned(picture: np.ndarray, board: Checkerboard) -> list:
-    found = view_alignment.find_target(picture, board, are_mirrored=False)
+    found = view_alignment.find_target_in_views(picture, board, are_mirrored=False)
     sizes = {"sensor": picture.shape, "model": (88, 88)}
     views = view_alignment.fit_homographies(found, **sizes).views
     assert views.positions == [(0, 0), (0, 1), (1, 0), (1, 1)]
@@ -50,13 +50,13 @@ def test_of_other_boards_views_are_said_to_be_taken_as_upright(rows, cols):
 def test_a_target_without_a_turn_is_said_of_lens_arrays_only(target, are_mirrored, is_said):
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
-        view_alignment.find_target(np.zeros((90, 120), np.uint8), target, are_mirrored)
+        view_alignment.find_target_in_views(np.zeros((90, 120), np.uint8), target, are_mirrored)
     assert any("taken as upright" in str(one.message) for one in said) == is_said
 
 
 def test_a_view_that_shows_a_part_of_the_board_is_warned_of():
     picture, board, sizes = show_boards(5, 6), Checkerboard(5, 6), {"model": (88, 88)}
-    found = dict(view_alignment.find_target(picture, board, are_mirrored=False))
+    found = dict(view_alignment.find_target_in_views(picture, board, are_mirrored=False))
     sizes |= {"sensor": picture.shape}
     view_alignment.fit_homographies(found, **sizes)
     left = found[1, 1].copy()

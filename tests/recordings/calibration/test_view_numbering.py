@@ -36,7 +36,7 @@ def show_boards(rows: int, cols: int, width: int = 240, shift_px: int = 0) -> np
 
 
 def align(picture: np.ndarray, model=(208, 368)) -> Views:
-    found = view_alignment.find_target(picture, Checkerboard(5, 7))
+    found = view_alignment.find_target_in_views(picture, Checkerboard(5, 7))
     return view_alignment.fit_homographies(found, sensor=picture.shape, model=model).views
 
 
@@ -112,7 +112,7 @@ def test_two_targets_at_one_position_are_refused(monkeypatch):
     )
     message = r"view \(0, 0\) must show one target, got two at pixels \(x, y\) \(\d+, \d+\) and"
     with pytest.raises(ValueError, match=message):
-        view_alignment.find_target(show_boards(1, 2), Checkerboard(5, 7))
+        view_alignment.find_target_in_views(show_boards(1, 2), Checkerboard(5, 7))
 
 
 def test_a_target_found_twice_counts_once():

@@ -19,14 +19,14 @@ def fitted(strength: float, airy: float, pixel: float, allowed: float) -> Simple
 def test_errors_are_within_what_is_allowed(strength, airy, pixel):
     for allowed in (0.2, 0.26, 0.5):
         found = fitted(strength, airy, pixel, allowed)
-        assert found.error_psf + found.error_grid + found.error_kernel <= allowed + 1e-6
+        assert found.psf_error + found.psf_grid_error + found.psf_size_error <= allowed + 1e-6
         assert found.psf_size_px % 2 == 1
-        assert found.psf_grid_pitch_px > 1 or found.error_grid == 0
+        assert found.psf_grid_pitch_px > 1 or found.psf_grid_error == 0
 
 
 def test_what_cannot_be_had_is_the_least_error():
     found = fitted(10.0, 1.0, 0.16, 0.01)
-    assert found.error_psf + found.error_grid + found.error_kernel > 0.01
+    assert found.psf_error + found.psf_grid_error + found.psf_size_error > 0.01
     assert found.psf_network == len(find_psf_band(10.0).networks) - 1
     assert found.psf_grid_pitch_px == 1
 
