@@ -38,7 +38,7 @@ def convert_to_form(network: EventToVideoNetwork, form: str) -> EventToVideoNetw
 class Bf16Network(EventToVideoNetwork):
     """A copy of `network` with weights and maps in bf16, channels last; frames are float32.
 
-    `compiled`: by torch.compile, which takes a C++ compiler, half a minute at the first windows of
+    `compiled`: by torch.compile, which takes a C++ compiler, minutes at the first windows of
     every size, and as many threads as torch has then.
     """
 

@@ -72,5 +72,5 @@ def find_ends(axis: str, line: Float[np.ndarray, "k 2"], places: int) -> tuple[f
     else:
         column = {"x": 0, "y": 1}.get(axis)
         way = np.linalg.norm(line - line[0], axis=1) if column is None else line[:, column]
-        first, step = float(way[0]), float(way[-1] - way[0]) / max(places - 1, 1)
+        first, step = float(way[0]), float(way[-1] - way[0]) / max(places - 1, 1) or 1.0
     return first - step / 2, first + (places - 0.5) * step

@@ -100,10 +100,12 @@ def shrink_events(counts: Float[np.ndarray, "*n h w"]) -> Float[np.ndarray, "*n 
     """Return sums of polarity at most MAX_VIEW_PX long: of each area the one of largest magnitude,
     as in a mean single events would fade."""
     most = least = counts
-    shrink = MAX_VIEW_PX / max(counts.shape[-2:])
-    for axis in (-2, -1) if shrink < 1 else ():
+    height, width = counts.shape[-2:]
+    shrink = min(1.0, MAX_VIEW_PX / max(height, width))
+    height_px = max(1, round(height * shrink))
+    sizes = {-2: height_px, -1: max(1, round(width * height_px / height))}  # as resize_pictures
+    for axis, small in sizes.items():
         length = counts.shape[axis]
-        small = max(1, round(length * shrink))
         starts = np.arange(small) * length // small
         most = np.maximum.reduceat(most, starts, axis)
         least = np.minimum.reduceat(least, starts, axis)

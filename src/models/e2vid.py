@@ -100,7 +100,7 @@ class E2VID(EventToVideoNetwork):
         """Return the frame at the end of the window and the state, one entry per scale.
 
         Views are in the order of `layout`.  `window_s` and `positions` change nothing.  Raises
-        ValueError for another shape, for positions of another number or arrangement, and when
+        ValueError for another shape, for positions of another number or order, and when
         views, bins, the window's length or the sizes of the state do not fit.
         """
         x, (top, left) = self._padded(voxels, window_s, positions)
@@ -119,11 +119,21 @@ class E2VID(EventToVideoNetwork):
         """Raise ValueError unless `positions` are (row, col), one for each view, that stand to each
         other as in `layout`.
         """
+        self._check_order(positions)
+        if not is_arranged_as_layout(positions):
+            wanted = f"arranged as {list(layout(self.views))} for this network"
+            raise ValueError(f"positions must be {wanted}, got {list(positions)}")
+
+    def _check_order(self, positions: Sequence[Position]) -> None:
+        """Raise ValueError for another number of views, and for those of `layout` in another order:
+        others may be what the network was trained with.
+        """
         if len(positions) != self.views:
             wanted = f"{self.views} (row, col) for this network"
             raise ValueError(f"positions must be {wanted}, got {len(positions)}: {list(positions)}")
-        if not is_arranged_as_layout(positions):
-            wanted = f"arranged as {list(layout(self.views))} for this network"
+        in_order = sorted((int(row), int(col)) for row, col in positions)
+        if is_arranged_as_layout(in_order) and not is_arranged_as_layout(positions):
+            wanted = f"in the order {list(layout(self.views))} for this network"
             raise ValueError(f"positions must be {wanted}, got {list(positions)}")
 
     def _padded(
@@ -139,7 +149,7 @@ class E2VID(EventToVideoNetwork):
             raise ValueError(f"views, bins must be {wanted} {where}, got {got}")
         check_window_length(window_s)
         if positions is not None:
-            self.check_positions(positions)
+            self._check_order(positions)
         stacked = voxels.flatten(1, 2).to(self.first_layer.weight.dtype)
         return pad_centred_to_multiple(stacked, 2**SCALES)
 

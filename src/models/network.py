@@ -109,14 +109,14 @@ def check_voxel_shape(voxels: Tensor) -> None:
 
 def check_window_length(window_s: float | Tensor) -> None:
     """Raise ValueError unless `window_s` is finite and > 0 seconds; a tensor on a GPU, which would
-    be synchronised, and one that is traced are not looked at.
+    be synchronised, and what is traced are not looked at.
     """
     if isinstance(window_s, Tensor):
         is_traced = torch.jit.is_tracing() or torch.compiler.is_compiling()
         is_known = window_s.device.type == "cpu" and not is_traced
         if is_known and not ((window_s > 0) & window_s.isfinite()).all():
             raise ValueError(f"window_s must be > 0 seconds, got {window_s.tolist()}")
-    elif not 0 < window_s < math.inf:
+    elif not torch.compiler.is_compiling() and not 0 < window_s < math.inf:
         raise ValueError(f"window_s must be > 0 seconds, got {window_s}")
 
 

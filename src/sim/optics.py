@@ -53,7 +53,7 @@ def is_arranged_as_layout(positions: Sequence[Position]) -> bool:
 
 
 def _axis_ranks(positions: Sequence[Position]) -> list[list[int]]:
-    axes = [[position[axis] for position in positions] for axis in range(2)]
+    axes = [[int(position[axis]) for position in positions] for axis in range(2)]
     return [[sorted(set(places)).index(place) for place in places] for places in axes]
 
 

@@ -40,6 +40,7 @@ def test_single_events_of_a_large_view_are_as_dark_when_it_is_shrunk():
     assert small.shape == (2, 120, 160)
     assert small[0, 25, 50] == -2 and small[1, -1, -1] == 1 and np.count_nonzero(small) == 2
     assert np.array_equal(shrink_events(counts[:, :100, :150]), counts[:, :100, :150])
+    assert shrink_events(np.zeros((1, 333, 500))).shape == (1, 107, 161)  # as of other panels
 
 
 def test_panels_stand_side_by_side_under_their_names():

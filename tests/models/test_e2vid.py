@@ -126,7 +126,7 @@ def test_other_views_or_bins_are_refused(shape):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"positions": layout(2)[::-1]}, r"^positions must be arranged as \[\(0, 0\), \(0, 1\)\]"),
+        ({"positions": layout(2)[::-1]}, r"^positions must be in the order \[\(0, 0\), \(0, 1\)\]"),
         ({"positions": [(7, 7)] * 3}, r"^positions must be 2 \(row, col\) for this network, got 3"),
         ({"window_s": -1.0}, "^window_s must be > 0 seconds, got -1.0"),
         ({"window_s": math.nan}, "^window_s must be > 0 seconds, got nan"),
@@ -147,6 +147,8 @@ def test_positions_of_any_spacing_and_length_of_window_change_nothing():
     network, window = small(), voxels()[:, 0]
     frame, _ = network(window, window_s=0.3, positions=[(2, -3), (2, 5)])
     assert torch.equal(frame, network(window)[0])
+    down = network(window, positions=torch.tensor([(-1, 0), (0, 0)]))[0]  # as a column trained it
+    assert torch.equal(frame, down)
 
 
 @pytest.mark.parametrize("kind", [torch.float64, torch.int64, torch.bfloat16])

@@ -149,11 +149,11 @@ def format_value(value: float, limit: float) -> str:
     it stands, or as on the other side of it."""
     if not math.isfinite(value):
         return "∞" if value > 0 else "–"
-    if value in (0, limit):
+    if value == 0 or math.isclose(value, limit):
         return _format_digits(value, 0)
     texts = (_format_digits(value, more) for more in range(20))
     side = np.sign(value - limit)
-    return next(text for text in texts if np.sign(float(text) - limit) == side)
+    return next((text for text in texts if np.sign(float(text) - limit) == side), f"{value:g}")
 
 
 def _format_digits(value: float, more: int) -> str:

@@ -11,6 +11,7 @@ from src.recordings.files.event_file import PIECE_EVENTS, RawEvents
 BLOCK_BYTES = 2**20
 LEAST_ZEROS = 64  # bytes at the end that are no events, but were never written
 NEARLY_A_TURN = 0.98  # of a counter's turn, by which a late event from before its end rises
+LATE_EVENTS = 1000  # at most, of which one follows the other before the counter falls again
 
 
 def read_whole_words(
@@ -50,7 +51,8 @@ def find_end_before_zeros(path: Path, start: int) -> tuple[int, int]:
 class TimestampUnwrapper:
     """A counter of `bits`, read in pieces: it went round where it falls by more than half.
 
-    A rise of NEARLY_A_TURN or more after that is a late event, of the round before."""
+    A rise of NEARLY_A_TURN or more after that is a late event, of the round before, where the
+    counter falls again within LATE_EVENTS; else it is a silence."""
 
     def __init__(self, bits: int = 32):
         self._bits, self._last, self._rounds = bits, 0, 0
@@ -61,7 +63,10 @@ class TimestampUnwrapper:
         if len(times):
             steps, turn = np.diff(times, prepend=self._last), 1 << self._bits
             self._last = int(times[-1])
-            times += self._count_rounds(steps < -(turn >> 1), steps >= NEARLY_A_TURN * turn) * turn
+            falls = steps < -(turn >> 1)
+            times += (
+                self._count_rounds(falls, _find_late(steps >= NEARLY_A_TURN * turn, falls)) * turn
+            )
         return times
 
     def _count_rounds(self, is_next: np.ndarray, is_before: np.ndarray) -> np.ndarray | int:
@@ -72,6 +77,14 @@ class TimestampUnwrapper:
         rounds -= np.minimum.accumulate(np.minimum(rounds, 0))
         self._rounds = int(rounds[-1])
         return rounds
+
+
+def _find_late(rises: np.ndarray, falls: np.ndarray) -> np.ndarray:
+    """Return the rises after which a counter falls, or the piece ends, within LATE_EVENTS."""
+    if rises.any():
+        at, ends = np.flatnonzero(rises), np.append(np.flatnonzero(falls), len(falls))
+        rises[at] = ends[np.searchsorted(ends, at)] - at <= LATE_EVENTS
+    return rises
 
 
 def merge_small_pieces(pieces: Iterator[RawEvents]) -> Iterator[RawEvents]:

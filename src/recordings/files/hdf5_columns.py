@@ -21,7 +21,8 @@ from src.recordings.files.event_file import ReadOptions, refuse_column_order
 from src.recordings.files.numpy_file import LazyColumn, has_event_per_column, split_table
 from src.recordings.files.time_unit import UNITS_US
 
-OF_A_CAMERA = re.compile(r"(?<![a-z])(?:cam|camera|view|sensor)[\W_]*$")  # before a number
+# Before a number: cam0, leftcam0, cameras/0, view_0, but not review0.
+OF_A_CAMERA = re.compile(r"(?:cam|camera|(?<![a-z])view|(?<![a-z])sensor)s?[\W_]*$")
 
 
 def find_event_columns(node: Any, order: str | None) -> dict[str, Any]:

@@ -5,6 +5,7 @@ layout of TimeLens's recordings (HS-ERGB, BS-ERGB; Tulyakov et al. 2021, 2022) a
 """
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -44,21 +45,30 @@ class NpzFolder(EventFile):
     """
 
     def __init__(self, path: Path, options: ReadOptions):
-        self.path, self._folder = path, find_npz_folder(path) or path
-        self._names = _list_npz(self._folder)
-        tables = (read_nameless_table(name, options) for name in self._names)
-        self._options = replace(options, columns=options.columns or find_order_of_windows(tables))
-        first = NumpyFile(self._names[0], self._options)
+        self.path, self._options = path, options
+        self._folder = find_npz_folder(path) or path
+        self._names, self._order = _list_npz(self._folder), None
+        if options.columns is None:
+            tables = (read_nameless_table(name, options) for name in self._names)
+            self._order = find_order_of_windows(tables)
+        first = self._open(self._names[0])
         self.size, self.notes, self.time_unit = first.size, first.notes, first.time_unit
+
+    def _open(self, name: Path) -> NumpyFile:
+        """Return a window; one whose columns have names takes these, not the common order."""
+        if self._order is not None:
+            with suppress(ValueError):
+                return NumpyFile(name, replace(self._options, columns=self._order))
+        return NumpyFile(name, self._options)
 
     def pieces(self) -> Iterator[RawEvents]:
         for name in self._names:
-            for t, x, y, p in NumpyFile(name, self._options).pieces():
+            for t, x, y, p in self._open(name).pieces():
                 yield RawEvents(t, *self._whole_pixels(x, y), p)
 
     def times(self) -> Iterator[np.ndarray]:
         for name in self._names:
-            yield from NumpyFile(name, self._options).times()
+            yield from self._open(name).times()
 
     def frames(self) -> RawFrames | None:
         return self._frames
@@ -73,7 +83,7 @@ class NpzFolder(EventFile):
             return False
         seen, largest = 0, 0
         for name in self._names:
-            for piece in NumpyFile(name, self._options).pieces():
+            for piece in self._open(name).pieces():
                 seen, largest = seen + len(piece.x), max(largest, piece.x.max(initial=0))
             if seen >= ENOUGH_EVENTS:
                 break

@@ -5,6 +5,7 @@ concerned.
 """
 
 import os
+import stat
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from copy import copy
@@ -263,9 +264,18 @@ def find_file_states(path: Path) -> tuple[FileState, ...]:
         events = (path / name for name in EVENT_FOLDERS)
         pictures = (place / name for place in (path, path.parent) for name in PICTURE_FOLDERS)
         folders = dict.fromkeys(filter(Path.is_dir, (*events, *pictures)))
-        files = (file for folder in folders for file in os.scandir(folder) if file.is_file())
-    states = ((os.fspath(file), file.stat()) for file in files)
-    return tuple(sorted((name, state.st_mtime_ns, state.st_size) for name, state in states))
+        files = (file for folder in folders for file in os.scandir(folder))
+    return tuple(sorted(filter(None, map(_find_file_state, files))))
+
+
+def _find_file_state(file: Path | os.DirEntry) -> FileState | None:
+    """Return None for what is no file, or none any more."""
+    try:
+        state = file.stat()
+    except OSError:
+        return None
+    is_file = stat.S_ISREG(state.st_mode)
+    return (os.fspath(file), state.st_mtime_ns, state.st_size) if is_file else None
 
 
 def _open_file(path: Path, options: ReadOptions) -> EventFile:

@@ -211,10 +211,23 @@ def test_all_windows_tell_the_order_of_columns(tmp_path, events, few):
         assert all(np.array_equal(found[name], wanted[:, k]) for k, name in enumerate("txy"))
 
 
+def test_a_window_with_names_among_those_without_is_read_by_them(tmp_path, events):
+    rows = np.stack([events[name].astype(int) for name in "txyp"], 1)
+    (tmp_path / "events").mkdir()
+    many = [rows + np.array([400_000 * k, 0, 0, 0]) for k in range(5)]
+    for number, part in enumerate(many):
+        np.savez(tmp_path / "events" / f"{number}.npz", part)
+    last = dict(zip("pyxt", (rows + np.array([2_000_000, 0, 0, 0])).T[::-1], strict=True))
+    np.savez(tmp_path / "events" / "5.npz", **last)
+    found = quiet_read(tmp_path, time_unit="us")
+    assert np.array_equal(found["t"], np.concatenate([*(m[:, 0] for m in many), last["t"]]))
+
+
 def test_hidden_files_are_no_windows(tmp_path, events):
     write_npz_window(tmp_path, events)
     for name in ("._0.npz", ".partial.npz"):
         (tmp_path / "events" / name).write_bytes(b"PK")
+    (tmp_path / "events" / "round").symlink_to("round")
     assert np.array_equal(quiet_read(tmp_path), events)
 
 
@@ -226,7 +239,14 @@ def test_cameras_with_numbers_are_several_recordings(tmp_path, events):
 
 @pytest.mark.parametrize(
     ("name", "sizes"),
-    [("cam", ()), ("Camera_", ()), ("rig/view", ()), ("events", ((320, 240), (640, 480)))],
+    [
+        ("cam", ()),
+        ("Camera_", ()),
+        ("rig/view", ()),
+        ("views/", ()),
+        ("leftcam", ()),
+        ("events", ((320, 240), (640, 480))),
+    ],
 )
 @pytest.mark.parametrize("first", [0, 1500])
 def test_cameras_one_after_the_other_are_several_recordings(tmp_path, events, name, sizes, first):

@@ -161,6 +161,11 @@ def test_a_counter_whose_events_are_out_of_order_goes_round_once(bits, duration,
 def test_a_long_silence_after_a_counter_went_round_is_kept():
     t = 2**32 + np.array([-5, 3, 40 * 60 * 1_000_000, 2**32 - 10, 2**32 + 4, 2**32 - 2])
     assert np.array_equal(TimestampUnwrapper().unwrap(t % 2**32), t)
+    turn = 2**24
+    early = turn + np.arange(50_000)
+    late = early[-1] + int(0.985 * turn) + np.arange(20_000)
+    t = np.concatenate([[turn - 9], early, late])
+    assert np.array_equal(TimestampUnwrapper(24).unwrap(t % turn), t)
 
 
 def test_a_single_wild_time_and_a_restart_are_no_counter_that_goes_round():
