@@ -119,18 +119,21 @@ class E2VID(EventToVideoNetwork):
         """Raise ValueError unless `positions` are (row, col), one for each view, that stand to each
         other as in `layout`.
         """
-        self._check_order(positions)
+        self._check_number(positions)
         if not is_arranged_as_layout(positions):
             wanted = f"arranged as {list(layout(self.views))} for this network"
             raise ValueError(f"positions must be {wanted}, got {list(positions)}")
+
+    def _check_number(self, positions: Sequence[Position]) -> None:
+        if len(positions) != self.views:
+            wanted = f"{self.views} (row, col) for this network"
+            raise ValueError(f"positions must be {wanted}, got {len(positions)}: {list(positions)}")
 
     def _check_order(self, positions: Sequence[Position]) -> None:
         """Raise ValueError for another number of views, and for those of `layout` in another order:
         others may be what the network was trained with.
         """
-        if len(positions) != self.views:
-            wanted = f"{self.views} (row, col) for this network"
-            raise ValueError(f"positions must be {wanted}, got {len(positions)}: {list(positions)}")
+        self._check_number(positions)
         in_order = sorted((int(row), int(col)) for row, col in positions)
         if is_arranged_as_layout(in_order) and not is_arranged_as_layout(positions):
             wanted = f"in the order {list(layout(self.views))} for this network"

@@ -149,7 +149,7 @@ def format_value(value: float, limit: float) -> str:
     it stands, or as on the other side of it."""
     if not math.isfinite(value):
         return "∞" if value > 0 else "–"
-    if value == 0 or math.isclose(value, limit):
+    if value in (0, limit):
         return _format_digits(value, 0)
     texts = (_format_digits(value, more) for more in range(20))
     side = np.sign(value - limit)
