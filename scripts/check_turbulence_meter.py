@@ -197,6 +197,7 @@ def compare_measurement(
     """Return what was found over what is known, and whether the intervals hold the atmosphere's."""
     rms, half, whole, decay = describe_tilt(tilt)
     length = _number(found.tilt_correlation_half_length_px)
+    time_s = _number(found.tilt_correlation_time_s)
     own, reach = path.tilt_std_px(SIDE), path.tilt_correlation_half_length_px(SIDE)
     return {
         "rms of clip": found.tilt_rms_px.value / rms,
@@ -206,9 +207,8 @@ def compare_measurement(
         "half length of atmosphere": length / reach,
         "half length held": _holds(found.tilt_correlation_half_length_px, reach),
         "whole view less clip's": found.global_tilt_share.value - whole,
-        "decay of clip": _number(found.tilt_correlation_time_s) / decay,
-        "decay of atmosphere": _number(found.tilt_correlation_time_s)
-        / tilt_correlation_time_s(path),
+        "decay of clip": time_s / decay,
+        "decay of atmosphere": time_s / tilt_correlation_time_s(path),
         "blur of atmosphere": found.blur_px.value / path.blur_px(SIDE),
         "blur held": _holds(found.blur_px, path.blur_px(SIDE)),
     }
@@ -284,10 +284,8 @@ def measure_warps(
         frames, tilt = warp_photograph(load_photograph(k, SIDE), half, rms, k)
         found = measure_or_refusal(compress(frames))
         if not isinstance(found, str):
-            known, length = (
-                describe_tilt(tilt),
-                _number(found.found.tilt_correlation_half_length_px),
-            )
+            known = describe_tilt(tilt)
+            length = _number(found.found.tilt_correlation_half_length_px)
             rows.append((found.found.tilt_rms_px.value / known[0], length / known[1]))
     ranges = ("-".join(f"{v:.2f}" for v in sorted(v)) for v in zip(*rows, strict=True))
     return ", ".join(ranges) or "refused"

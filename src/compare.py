@@ -23,15 +23,15 @@ FORMS: dict[str, list] = {
 LARGEST_NUMBER = 1e5  # of a slice: pixels, turns a second, degrees
 MOST_SHOWN = 100
 NOTES = {
-    "residual_displacement_px": ("residual displacement, if static: ", ".2f", " px"),
-    "line_deviation_px": ("deviation from a line, if moving: ", ".2f", " px"),
-    "contrast": ("contrast: ", ".3f", ""),
-    "flicker": ("change from frame to frame: ", ".3f", " of the contrast"),
-    "ssim": ("SSIM with the camera: ", ".3f", ""),
-    "lpips": ("LPIPS: ", ".3f", ""),
-    "lpips_aligned": ("LPIPS, brightness and contrast aligned: ", ".3f", ""),
-    "correlation": ("correlation: ", ".3f", ""),
-}  # text, format of the value, unit
+    "residual_displacement_px": ("residual displacement, if static", "{:.2f} px"),
+    "line_deviation_px": ("deviation from a line, if moving", "{:.2f} px"),
+    "contrast": ("contrast", "{:.3f}"),
+    "flicker": ("change from frame to frame", "{:.3f} of the contrast"),
+    "ssim": ("SSIM with the camera", "{:.3f}"),
+    "lpips": ("LPIPS", "{:.3f}"),
+    "lpips_aligned": ("LPIPS, brightness and contrast aligned", "{:.3f}"),
+    "correlation": ("correlation", "{:.3f}"),
+}  # a measure in words, and its value
 
 
 def compare(cfg: DictConfig) -> dict:
@@ -133,8 +133,8 @@ def _format_note(scores: dict) -> str:
     """Return a line for each measure; a dash for one that the videos do not show."""
     lines = []
     for measure, value in scores.items():
-        text, form, unit = NOTES[measure]
-        lines.append(text + ("-" if math.isnan(value) else f"{value:{form}}{unit}"))
+        name, form = NOTES[measure]
+        lines.append(f"{name}: {'-' if math.isnan(value) else form.format(value)}")
     return "\n".join(lines)
 
 

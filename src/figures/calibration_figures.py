@@ -205,7 +205,7 @@ def draw_measured_turbulence(measured: TurbulenceMeasurement, title: str, path: 
     distance.set_xticks(DISTANCE_TICKS, map(str, DISTANCE_TICKS))
     distance.set(
         xlim=(-0.1, 1.45 * SIDE), ylim=(-0.3, 1.3), xlabel=f"distance, px of a frame of {SIDE}",
-        ylabel="correlation of the tilt", title=describe_excess(tilt.correlation[0]),
+        ylabel="correlation of the tilt", title=describe_tracking_error(tilt.correlation[0]),
     )  # fmt: skip
     distance.legend(loc="lower left")
 
@@ -222,7 +222,7 @@ def draw_measured_turbulence(measured: TurbulenceMeasurement, title: str, path: 
     return save_figure(figure, path)
 
 
-def describe_excess(correlation: float) -> str:
+def describe_tracking_error(correlation: float) -> str:
     """Return the title for the correlation of points at distance 0, over the fit's, which is 1:
     what it has more is the error of tracking; nothing where it is not more, or unknown."""
     excess = correlation - 1

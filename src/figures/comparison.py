@@ -41,7 +41,7 @@ def draw_comparison(
     panel_height = max(PANEL_WIDTH_IN * height / width, MIN_PANEL_HEIGHT_IN)
     size = (PANEL_WIDTH_IN * columns + 0.5, (panel_height + 0.2) * len(rows) + 0.4)
     figure = Figure(figsize=size)
-    first, last = find_ends(axis, line, rows[0].slice.shape[1])
+    first, last = find_slice_ends(axis, line, rows[0].slice.shape[1])
     unit = "degrees" if axis == "theta" else "px"
     grid = figure.subplots(len(rows), columns, squeeze=False)
     for row, axes in zip(rows, grid, strict=True):
@@ -64,7 +64,7 @@ def draw_comparison(
     save_figure(figure, path)
 
 
-def find_ends(axis: str, line: Float[np.ndarray, "k 2"], places: int) -> tuple[float, float]:
+def find_slice_ends(axis: str, line: Float[np.ndarray, "k 2"], places: int) -> tuple[float, float]:
     """Return where a slice of so many `places` along `line` begins and ends, half a place before
     the first and after the last: x, y, or r from the first, in pixels, or theta in degrees."""
     if axis == "theta":

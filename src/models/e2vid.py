@@ -134,8 +134,9 @@ class E2VID(EventToVideoNetwork):
         others may be what the network was trained with.
         """
         self._check_number(positions)
-        in_order = sorted((int(row), int(col)) for row, col in positions)
-        if is_arranged_as_layout(in_order) and not is_arranged_as_layout(positions):
+        if is_arranged_as_layout(positions):
+            return
+        if is_arranged_as_layout(sorted((int(row), int(col)) for row, col in positions)):
             wanted = f"in the order {list(layout(self.views))} for this network"
             raise ValueError(f"positions must be {wanted}, got {list(positions)}")
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from src.figures.comparison import VideoRow, draw_comparison, find_ends
+from src.figures.comparison import VideoRow, draw_comparison, find_slice_ends
 from src.figures.slices import (
     circle_points,
     line_points,
@@ -126,4 +126,4 @@ def test_times_and_places_of_a_comparison_are_those_of_the_frames(tmp_path, monk
     ],
 )
 def test_a_slice_begins_and_ends_half_a_place_beyond_its_points(axis, line, ends):
-    assert find_ends(axis, line, len(line)) == pytest.approx(ends)
+    assert find_slice_ends(axis, line, len(line)) == pytest.approx(ends)

@@ -86,21 +86,19 @@ def _fit(
     start, shape = np.vstack([affine, [0, 0, 1]]), _normalise(tile)
     back, shape_px = np.linalg.inv(shape), 1 / np.diag(shape)[:2].mean()
 
-    def homography(change: np.ndarray) -> np.ndarray:
-        matrix = back @ (np.eye(3) + np.append(change[:8], 0).reshape(3, 3)) @ shape @ start
-        return matrix / matrix[2, 2]
-
-    def turned(change: np.ndarray) -> CornerFold | None:
-        return replace(fold, angle_rad=float(change[8])) if fold else None
+    def view(change: np.ndarray) -> View:
+        moved = np.eye(3) + np.append(change[:8], 0).reshape(3, 3)
+        matrix = back @ moved @ shape @ start
+        turned = replace(fold, angle_rad=float(change[8])) if fold else None
+        return View(position, matrix / matrix[2, 2], fold=turned)
 
     def errors(change: np.ndarray) -> np.ndarray:
-        placed, halves = cv2.perspectiveTransform(at[None], homography(change))[0], turned(change)
-        off = (halves.turn_halves(placed) if halves else placed) - places
+        off = view(change).to_centre(at) - places
         return np.concatenate([off.ravel(), change * shape_px * ROBUST_PX / LOOSE_PX])
 
     zero = np.zeros(9 if fold else 8)
     found: OptimizeResult = least_squares(errors, zero, loss="soft_l1", f_scale=ROBUST_PX)
-    return View(position, homography(found.x), fold=turned(found.x)), float(found.cost)
+    return view(found.x), float(found.cost)
 
 
 def _normalise(tile: Rectangle) -> np.ndarray:

@@ -7,6 +7,7 @@ pitch: the right ones bring equal columns together.
 
 from dataclasses import dataclass, replace
 from itertools import product
+from operator import itemgetter
 
 import cv2
 import numpy as np
@@ -133,19 +134,24 @@ def find_axis(gram: Gram) -> ViewAxis:
     n, total = len(gram), max(float(np.trace(gram)), 1e-9)
     size = np.sqrt(np.maximum(np.diag(gram), 0))
     grams = np.stack([gram, np.outer(size, size)])
-    best, score, highest = (0.0, float(n)), 0.0, -np.inf
-    for pitch in np.arange(max(n / MAX_VIEWS, 8), n / 2 / WHOLE, 0.5):
-        seams = np.arange(0.0, pitch)
-        shared, possible = _share(grams, seams, pitch).sum((-2, -1))
-        many_and_alike = shared * np.abs(shared) / np.maximum(possible, 1e-9)
-        seam = int(np.argmax(many_and_alike))
-        if many_and_alike[seam] > highest:
-            best, highest = (float(seams[seam]), float(pitch)), many_and_alike[seam]
-            score = float(shared[seam]) / total
-    axis = _whole_views(gram, *best, score=score)
+    pitches = np.arange(max(n / MAX_VIEWS, 8), n / 2 / WHOLE, 0.5).tolist()
+    tried = [(*_find_seam(grams, pitch), pitch) for pitch in pitches]
+    _, shared, seam, pitch = max(tried, key=itemgetter(0), default=(0.0, 0.0, 0.0, float(n)))
+    axis = _whole_views(gram, seam, pitch, score=shared / total)
     if axis.score >= MIN_SCORE and axis.count == 1:
         axis = _between_two_seams(gram, axis)
     return axis if axis.score >= MIN_SCORE and axis.count > 1 else ViewAxis(0.0, n, 1, axis.score)
+
+
+def _find_seam(grams: Float[np.ndarray, "2 n n"], pitch: float) -> tuple[float, float, float]:
+    """Return the seam at which lines and mirrored neighbours share most in `grams`, the products of
+    lines and the largest these can be: how many and alike they are, what they share, and the seam.
+    """
+    seams = np.arange(0.0, pitch)
+    shared, possible = _share(grams, seams, pitch).sum((-2, -1))
+    many_and_alike = shared * np.abs(shared) / np.maximum(possible, 1e-9)
+    best = int(np.argmax(many_and_alike))
+    return float(many_and_alike[best]), float(shared[best]), float(seams[best])
 
 
 def _between_two_seams(gram: Gram, axis: ViewAxis) -> ViewAxis:

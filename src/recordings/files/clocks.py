@@ -63,10 +63,8 @@ class TimestampUnwrapper:
         if len(times):
             steps, turn = np.diff(times, prepend=self._last), 1 << self._bits
             self._last = int(times[-1])
-            falls = steps < -(turn >> 1)
-            times += (
-                self._count_rounds(falls, _find_late(steps >= NEARLY_A_TURN * turn, falls)) * turn
-            )
+            falls, rises = steps < -(turn >> 1), steps >= NEARLY_A_TURN * turn
+            times += self._count_rounds(falls, _find_late(rises, falls)) * turn
         return times
 
     def _count_rounds(self, is_next: np.ndarray, is_before: np.ndarray) -> np.ndarray | int:
@@ -81,10 +79,12 @@ class TimestampUnwrapper:
 
 def _find_late(rises: np.ndarray, falls: np.ndarray) -> np.ndarray:
     """Return the rises after which a counter falls, or the piece ends, within LATE_EVENTS."""
-    if rises.any():
-        at, ends = np.flatnonzero(rises), np.append(np.flatnonzero(falls), len(falls))
-        rises[at] = ends[np.searchsorted(ends, at)] - at <= LATE_EVENTS
-    return rises
+    if not rises.any():
+        return rises
+    at, ends = np.flatnonzero(rises), np.append(np.flatnonzero(falls), len(falls))
+    late = np.zeros_like(rises)
+    late[at] = ends[np.searchsorted(ends, at)] - at <= LATE_EVENTS
+    return late
 
 
 def merge_small_pieces(pieces: Iterator[RawEvents]) -> Iterator[RawEvents]:

@@ -279,7 +279,7 @@ def folder(tmp_path_factory):
     [(1.12, "tracking error: 0.12 above the fit at distance 0"), (0.9, ""), (float("nan"), "")],
 )
 def test_an_excess_at_distance_0_is_told_where_there_is_one(correlation, title):
-    assert calibration_figures.describe_excess(correlation) == title
+    assert calibration_figures.describe_tracking_error(correlation) == title
 
 
 def test_calibrate_writes_a_file_and_a_figure(folder, tmp_path):
