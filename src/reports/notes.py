@@ -42,8 +42,8 @@ def describe_few_scenes(counts: Iterable[int]) -> str:
     held = dict.fromkeys(f"{100 * compute_coverage(count):.0f}" for count in few)
     shown = " or ".join(map(str, few))
     return (
-        f" CIs resample {shown} photographs or scenes: with so few they hold the mean of one seed "
-        f"in about {' or '.join(held)} % of cases."
+        f" Of {shown} photographs or scenes such a CI holds one seed's mean in about "
+        f"{' or '.join(held)} % of cases."
     )
 
 

@@ -158,7 +158,7 @@ def test_pairs_of_a_sweep_are_subtracted_clip_by_clip(tmp_path):
 def test_intervals_over_few_scenes_say_how_often_they_hold_the_mean(tmp_path):
     few, many = (dict.fromkeys(map(str, range(count)), 0.3) for count in (12, 20))
     sides = [found(tmp_path, name, few) for name in ("a", "b")]
-    said = " CIs resample {} photographs or scenes: with so few they hold the mean of one seed in "
+    said = " Of {} photographs or scenes such a CI holds one seed's mean in "
     note = build_difference_table("", *sides, PAPER).note
     assert said.format(12) + "about 91 % of cases." in note
     keys, groups = run_groups.group_runs([run for side in sides for run in side])
@@ -168,7 +168,7 @@ def test_intervals_over_few_scenes_say_how_often_they_hold_the_mean(tmp_path):
     note = build_difference_table("", *sides, PAPER).note
     assert said.format(3) + "about 75 % of cases." in note
     larger = [found(tmp_path, name, many) for name in ("c", "d")]
-    assert "resample" not in build_difference_table("", *larger, PAPER).note
+    assert "scenes" not in build_difference_table("", *larger, PAPER).note
 
 
 def test_a_pair_with_a_run_missing_is_a_row_that_says_so(tmp_path):
