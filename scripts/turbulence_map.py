@@ -16,12 +16,10 @@ from matplotlib.figure import Figure
 
 from src.app.script import run_script
 from src.figures.plots import save_figure
-from src.metrics.bootstrap import bootstrap_difference_interval
 from src.metrics.table import METRICS
 from src.records import runs
-from src.records.results import list_sources
 from src.records.runs import Run
-from src.reports.differences import pool_same_clips
+from src.reports.differences import compare_clips, pool_same_clips
 
 SETNET = {1: "setnet_one", 3: "setnet_three", 5: "setnet_five", 9: "setnet_nine"}
 LPIPS_TOLERANCE = 0.005  # above that of nine views
@@ -62,16 +60,18 @@ def group_runs(found: Sequence[Run]) -> RunsBySetting:
 def compute_differences(
     grouped: RunsBySetting, ours: str, theirs: str, metric: str, digits: int
 ) -> Cells:
-    """Return ours - theirs; a star where the 95 % bootstrap CI excludes zero.  Raises ValueError
-    where the clips of both are not the same."""
+    """Return ours - theirs over the clips that both have scores of, no cell without one; a star
+    where the 95 % bootstrap CI excludes zero.  Raises ValueError where the clips of both are not
+    the same."""
     cells = {}
     for setting, by_name in grouped.items():
-        if ours in by_name and theirs in by_name:
-            pooled = pool_same_clips("folders", [by_name[ours]], [by_name[theirs]])
-            sides = [[[float(clip[metric]) for clip in clips] for clips in side] for side in pooled]
-            value = sum(sides[0][0]) / len(sides[0][0]) - sum(sides[1][0]) / len(sides[1][0])
-            low, high = bootstrap_difference_interval(*sides, groups=list_sources(pooled[0][0]))
-            cells[setting] = (value, f"{value:+z.{digits}f}" + ("*" if low * high > 0 else ""))
+        if ours not in by_name or theirs not in by_name:
+            continue
+        pooled = pool_same_clips("folders", [by_name[ours]], [by_name[theirs]])
+        if compared := compare_clips(*pooled, metric):
+            left, right, (low, high) = compared
+            star = "*" if low * high > 0 else ""
+            cells[setting] = (left - right, f"{left - right:+z.{digits}f}{star}")
     return cells
 
 

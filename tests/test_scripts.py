@@ -157,6 +157,11 @@ def test_the_turbulence_map_shows_where_more_views_help(tmp_path):
     assert turbulence_map.count_views_needed(cells) == {(7, 1): (9.0, "9")}
     with pytest.raises(ValueError, match=r"one run of lf3x3 for each setting, got .*lf3x3 and"):
         turbulence_map.group_runs([*found, run("lf3x3", 7, 1, [0.4, 0.5])])
+    del cells[7, 1]["lf3x3"].clips[0]["lpips"]
+    for clip in cells[40, 1]["lf3x3"].clips:
+        del clip["lpips"]
+    margins = turbulence_map.compute_differences(cells, "lf3x3", "single256", "lpips", 2)
+    assert margins == {(7, 1): (pytest.approx(-0.1), "-0.10")}
     cells[7, 1]["lf3x3"].clips[0]["name"] = "another"
     with pytest.raises(ValueError, match="folders must hold the same clips, got 2 sets"):
         turbulence_map.compute_differences(cells, "lf3x3", "single256", "lpips", 2)

@@ -130,25 +130,32 @@ def _as_typed(value: str) -> str:
 
 def name_job_folder(overrides: Iterable[str]) -> str:
     """Return the overrides of a sweep's job as the name of one folder, at most MAX_FOLDER_BYTES:
-    `experiment-lf3x3_seed-0`, so that it may be given as ckpt= without quotes.
+    `experiment-lf3x3_seed-0`, without quotes, so that it may be given as ckpt= without quotes.
 
     Longer ones have the last words of the keys, the values alone, or their ends.  Different
     overrides have different names: where a name could stand for others too, or is not whole, a hash
     of the overrides ends it.
     """
-    pairs = [override.partition("=")[::2] for override in sorted(overrides)]
-    pairs = [(key, _as_typed(value)) for key, value in pairs if key != "paths.out"]
-    name = _join_for_folder(f"{key}={value}" for key, value in pairs)
+    given = [override.partition("=")[::2] for override in sorted(overrides)]
+    pairs = [(key, _as_typed(value)) for key, value in given if key != "paths.out"]
+    shown = [(key, re.sub("['\"]", "", value)) for key, value in pairs]
+    name = _join_for_folder(f"{key}={value}" for key, value in shown)
     others = any(f"_{key}" in value for _, value in pairs for key, _ in pairs)
-    signs = any(sign in value for _, value in pairs for sign in "/=\\\n")
+    signs = any(sign in value for _, value in pairs for sign in "/=\\\n'\"")
     if not (others or signs or len(name.encode()) > MAX_FOLDER_BYTES):
         return name
-    shorter = _join_for_folder(f"{key.split('.')[-1]}={value}" for key, value in pairs)
-    ends = (_join_for_folder(value[-most:] for _, value in pairs) for most in (250, 40, 20, 10, 5))
+    shorter = _join_for_folder(f"{key.split('.')[-1]}={value}" for key, value in shown)
+    lengths = (250, 40, 20, 10, 5)
+    ends = (_join_for_folder(_cut(value, most) for _, value in shown) for most in lengths)
     room = MAX_FOLDER_BYTES - 9
     fitting = (text for text in (name, shorter, *ends) if len(text.encode()) <= room)
     kept = next(fitting, name.encode()[:room].decode(errors="ignore"))
     return f"{kept}_{hashlib.sha256(repr(pairs).encode()).hexdigest()[:8]}"
+
+
+def _cut(value: str, most: int) -> str:
+    """Return the end of a value, without the brackets of a list where it is not whole."""
+    return value if len(value) <= most else value.strip("[]")[-most:]
 
 
 def _join_for_folder(texts: Iterable[str]) -> str:

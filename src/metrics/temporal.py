@@ -3,8 +3,8 @@
 The displacement of a reconstruction against the truth is measured block by block with gradient
 least squares (Lucas & Kanade 1981), iterated; its change from frame to frame is temporal jitter.
 Gain and offset of each block are fitted first, so brightness does not matter.  On a photograph
-warped smoothly by 0.5 to 3 px rms, jitter reads 7 to 16 % high; blur does not show in it.  A part
-without the scene reads as if it moved with the truth: of a blank picture jitter says nothing.
+warped smoothly by 0.5 to 3 px rms, jitter reads 7 to 16 % high.  A part without the scene reads as
+if it moved with the truth: of a blank picture jitter says nothing.
 """
 
 import torch
@@ -59,6 +59,9 @@ def find_textured_pairs(target: Video) -> Bool[Tensor, " frames-1"]:
 def temporal_jitter_px(frames: Video, target: Video) -> Float[Tensor, " frames-1"]:
     """Return the rms change of the displacement from each frame to the next, in pixels per axis.
 
+    Blur of what moves reads as jitter, too: Gaussian blur of sigma 2 and 4 px alone as 0.1 and
+    0.3 px on a photograph that moves 0.8 px a frame, as 0.3 and 0.7 px on one that moves 2.3; of
+    what rests as 0.
     A block counts as much as its weaker weight in the two frames; 0 where `find_textured_pairs`
     has none.
     """

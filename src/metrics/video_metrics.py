@@ -99,12 +99,12 @@ class VideoMetrics(MetricCollection):
     whose target has a range (max - min) below 0.05, jitter pairs of frames without a textured
     block, too; a clip that has no others has no such score.
 
-    Frames are clipped to [0, 1]; the data range is 1.  `resolution_scale`: frames and targets are
-    scored at so many times their own resolution, temporal jitter in pixels of the scored frame.
-    Whole numbers repeat pixels, so that PSNR stays, and multiply jitter; below 1 areas are
-    averaged.  `jitter_reduction`: frames are made so many times smaller before jitter is measured,
-    so that its blocks show as much of a larger frame.  Raises ValueError for another, and for a
-    name in `own` that is taken.
+    Frames are clipped to [0, 1], with NaN for what is not finite; the data range is 1.
+    `resolution_scale`: frames and targets are scored at so many times their own resolution,
+    temporal jitter in pixels of the scored frame.  Whole numbers repeat pixels, so that PSNR stays,
+    and multiply jitter; below 1 areas are averaged.  `jitter_reduction`: frames are made so many
+    times smaller before jitter is measured, so that its blocks show as much of a larger frame.
+    Raises ValueError for another, and for a name in `own` that is taken.
     """
 
     def __init__(
@@ -140,7 +140,7 @@ class VideoMetrics(MetricCollection):
     @torch.no_grad()
     def forward(self, frames: Video, target: Video) -> dict[str, float | None]:
         """Add a clip; return its scores by name, None for one that it does not have."""
-        pair = (frames.float().clamp(0, 1), target)
+        pair = (frames.float().clamp(0, 1).where(frames.isfinite(), torch.nan), target)
         values = super().forward(*(resample(video, self.resolution_scale) for video in pair))
         return {k: float(v) if self._is_clip_scored(k) else None for k, v in values.items()}
 

@@ -55,14 +55,8 @@ class Run:
     @property
     def result_settings_without_seed(self) -> dict[str, Any]:
         """The settings that numbers depend on but the seed, as {dotted key: value}."""
-        # Where nothing is trained the seed is that of the test clips.
-        is_training = self.record["task"] == "train"
-        same = MACHINE if is_training else (*MACHINE, *PROCESSES, "data.test_seed")
-        return {
-            key: value
-            for key, value in self.settings.items()
-            if key.split(".")[0] not in WITHOUT_NUMBERS and key not in same
-        }
+        train = self.record["task"] == "train"
+        return {k: value for k, value in self.settings.items() if is_result_setting(k, train)}
 
     @property
     def test_seed(self) -> int:
@@ -76,6 +70,13 @@ class SweepPlan:
     sweep: str
     command: str
     jobs: list[list[str]]
+
+
+def is_result_setting(key: str, train: bool) -> bool:
+    """Return whether numbers of a training (`train`), or of a test, depend on a setting other than
+    the seed; where nothing is trained `data.test_seed` is the seed."""
+    same = MACHINE if train else (*MACHINE, *PROCESSES, "data.test_seed")
+    return key.split(".")[0] not in WITHOUT_NUMBERS and key not in same
 
 
 def find_runs(folders: list[Path]) -> list[Run]:

@@ -10,7 +10,7 @@ from src.metrics.table import Column
 from src.records.results import frame_weights, list_sources
 from src.records.runs import Run
 from src.reports.clip_conditions import find_differing_test_conditions
-from src.reports.notes import describe_conditions, describe_runs
+from src.reports.notes import describe_conditions, describe_few_scenes, describe_runs
 from src.reports.run_groups import RunGroup, find_published, group_runs
 from src.reports.tables import Table, TableCell, list_metrics
 
@@ -48,6 +48,7 @@ def build_difference_table(
         texts.append("-" if change is None else f"{change:+.{digits}f}")
         table.rows.append([TableCell(text=text) for text in texts])
     table.note = f"{len(left_clips[0])} clips; {len(ours)} runs against {len(theirs)}.{left_out}"
+    table.note += describe_few_scenes([len(set(list_sources(left_clips[0])))])
     if len(ours) != len(theirs) and 1 in (len(ours), len(theirs)):
         table.note += " The CI has no spread over seeds of the single run."
     labels = list(zip(settings, *(group.label for group in groups), strict=True))
@@ -80,15 +81,17 @@ def pool_same_clips(
     """Return the clips of every run of both sides, or, where those of each are drawn from another
     seed, of all as of one run.
 
-    Raises ValueError, beginning with the `keys` of the config, unless all have the same clips.
+    Raises ValueError, beginning with the `keys` of the config, unless all of a seed have the same
+    clips.
     """
     first, second = (sorted({run.test_seed for run in side}) for side in (ours, theirs))
     if first != second:
         raise ValueError(f"{keys} must have clips of the same seeds, got {first} and {second}")
     runs = [*ours, *theirs]
-    names = {tuple((clip["name"], clip.get("frames")) for clip in run.clips) for run in runs}
-    if len(names) != 1 or () in names:
-        raise ValueError(f"{keys} must hold the same clips, got {len(names)} sets of them")
+    for seed in first:
+        names = {_list_clip_names(run) for run in runs if run.test_seed == seed}
+        if len(names) != 1 or () in names:
+            raise ValueError(f"{keys} must hold the same clips, got {len(names)} sets of them")
     if len(first) > 1 and any(len(side) > len(first) for side in (ours, theirs)):
         raise ValueError(f"{keys} must hold one run for each seed of clips, got more of {first}")
     if len(first) == 1:
@@ -98,6 +101,11 @@ def pool_same_clips(
         for side in (ours, theirs)
     )
     return [left], [right]
+
+
+def _list_clip_names(run: Run) -> tuple[tuple[str, str | None], ...]:
+    """Return the name and the number of frames, if it is stated, of every clip."""
+    return tuple((clip["name"], clip.get("frames")) for clip in run.clips)
 
 
 def compare_clips(

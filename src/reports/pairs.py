@@ -4,22 +4,24 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 from src.metrics.table import Column
+from src.records.results import list_sources
 from src.records.runs import Run
 from src.reports.clip_conditions import find_differing_test_conditions, is_test_condition
 from src.reports.differences import compare_clips, keep_common_seeds, pool_same_clips
-from src.reports.notes import describe_conditions, describe_runs
+from src.reports.notes import describe_conditions, describe_few_scenes, describe_runs
 from src.reports.run_groups import RunGroup
 from src.reports.tables import Table, TableCell, check_columns, list_metrics
 
 
 @dataclass
 class _Difference:
-    """The cells of a row, a metric each; the number of clips, 0 where a side is missing; sentences
-    on the two groups.
+    """The cells of a row, a metric each; the numbers of clips and of photographs or scenes that
+    they show, 0 where a side is missing; sentences on the two groups.
     """
 
     cells: list[TableCell]
     clips: int = 0
+    scenes: int = 0
     note: str = ""
     groups: list[RunGroup] = field(default_factory=list)
 
@@ -58,9 +60,10 @@ def build_pair_table(
         raise ValueError(f"pairs must have results of both on the same clips, got none of {listed}")
     table.note = f"{' or '.join(map(str, counts))} test clips; mean (95 % bootstrap CI); "
     table.note += "bold: the CI excludes zero."
+    table.note += describe_few_scenes(difference.scenes for _, difference in compared)
     table.note += "".join(dict.fromkeys(difference.note for _, difference in compared))
-    finished = [group for _, difference in compared for group in difference.groups]
-    table.note += describe_runs(keys, finished)
+    finished = {id(group): group for _, difference in compared for group in difference.groups}
+    table.note += describe_runs(keys, list(finished.values()))
     return table
 
 
@@ -76,7 +79,8 @@ def _compare_pair(
     found = [compare_clips(*pooled, metric.name) for metric in metrics]
     cells = [TableCell(f[0] - f[1], interval=f[2]) if f else TableCell() for f in found]
     note = left_out + describe_conditions(_find_other_conditions(setting, ours, theirs))
-    return _Difference(cells, len(pooled[0][0]), note, both)
+    clips = pooled[0][0]
+    return _Difference(cells, len(clips), len(set(list_sources(clips))), note, both)
 
 
 def _pair_groups(
@@ -89,8 +93,9 @@ def _pair_groups(
     def get_others(label: tuple[str, ...], pair: tuple[str, str]) -> tuple[str, ...]:
         return tuple(v for k, v in enumerate(label) if k != place and k not in bound[pair])
 
+    finished_last = sorted(groups, key=lambda group: bool(group.runs))  # they replace the others
     found = {(pair, group.label[place], get_others(group.label, pair)): group
-             for pair in pairs for group in groups}  # fmt: skip
+             for pair in pairs for group in finished_last}  # fmt: skip
     rows = dict.fromkeys((get_others(g.label, pair), pair) for g in groups for pair in pairs)
     for others, pair in rows:
         sides = [found.get((pair, name, others)) for name in pair]

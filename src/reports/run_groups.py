@@ -1,7 +1,7 @@
 """Runs that differ in their seed only form a group, labelled by the settings that tell it apart."""
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -9,7 +9,7 @@ from typing import Any
 import yaml
 
 from src.records import safe_yaml
-from src.records.runs import Run, SweepPlan
+from src.records.runs import Run, SweepPlan, is_result_setting
 from src.reports.clip_conditions import format_setting, list_settings, list_test_conditions
 
 FIRST_KEYS = ("task", "method", "experiment", "resolution", "postprocess", "baseline", "optics")
@@ -57,14 +57,14 @@ def group_runs(
 ) -> tuple[tuple[str, ...], list[RunGroup]]:
     """Return the keys of the labels, and a group per setting, in the order of the sweeps.
 
-    The keys are all that command lines have set and that differ, then the fewest other choices and
-    settings that tell the groups apart.  Like the seeds, the settings `across` do not part groups,
-    such as ckpt for networks of several seeds tested on the same clips.  Of two runs with one
-    setting and the same seeds the newer counts.
+    The keys are all that command lines have set and that differ, in jobs without results too, then
+    the fewest other choices and settings that tell the groups apart.  Like the seeds, the settings
+    `across` do not part groups, such as ckpt for networks of several seeds tested on the same
+    clips.  Of two runs with one setting and the same seeds the newer counts.
     """
     overridden = sorted({_override_key(override) for run in runs for override in run.overrides})
     rows = [_label_values(run, overridden, across) for run in runs]
-    keys = _distinguishing_keys(rows, overridden)
+    keys = _distinguishing_keys(rows, overridden, _find_planned_keys(runs, plans, across))
     groups: dict[tuple[str, ...], RunGroup] = {}
     newest: dict[tuple[str, ...], dict[tuple, Run]] = defaultdict(dict)
     for run, row in zip(runs, rows, strict=True):  # oldest first: the last one stays
@@ -131,6 +131,11 @@ def find_published(run: Run, published: Mapping[str, Any]) -> dict[str, float]:
     return {metric: value for metric, value in best.items() if metric != "when"}
 
 
+def _place(key: str) -> int:
+    """Return the place of a key in labels."""
+    return FIRST_KEYS.index(key) if key in FIRST_KEYS else len(FIRST_KEYS)
+
+
 def _override_key(override: str) -> str:
     return override.split("=")[0].lstrip("+~").split("@")[0]
 
@@ -155,20 +160,35 @@ def _label_values(run: Run, overridden: Sequence[str], across: Sequence[str]) ->
     for key in (key for key in overridden if key not in (*run.choices, *across)):
         inside = [v for k, v in settings.items() if k == key or k.startswith(key + ".")]
         first |= {key: ", ".join(inside)} if inside else {}
-    order = {key: place for place, key in enumerate(FIRST_KEYS)}
-    first = dict(sorted(first.items(), key=lambda item: order.get(item[0], len(order))))
+    first = dict(sorted(first.items(), key=lambda item: _place(item[0])))
     last = {k: v for k, v in run.choices.items() if k in LAST_KEYS}
     return first | last | {k: v for k, v in settings.items() if k not in first}
 
 
+def _find_planned_keys(
+    runs: Sequence[Run], plans: Sequence[SweepPlan], across: Sequence[str]
+) -> set[str]:
+    """Return the keys that tell the jobs of `plans` apart as settings of results; none where all
+    jobs have results."""
+    jobs = [job for plan in plans for job in plan.jobs]
+    if {frozenset(job) for job in jobs} <= {frozenset(run.overrides) for run in runs}:
+        return set()
+    values = [{_override_key(one): _override_value(one) for one in job} for job in jobs]
+    keys = {key for job in values for key in job if len({one.get(key) for one in values}) > 1}
+    train = any(run.record["task"] == "train" for run in runs)
+    return {key for key in keys if key not in across and is_result_setting(key, train)}
+
+
 def _distinguishing_keys(
-    rows: Sequence[dict[str, str]], overridden: Sequence[str]
+    rows: Sequence[dict[str, str]], overridden: Sequence[str], planned: Set[str]
 ) -> tuple[str, ...]:
-    """Return the `overridden` keys whose values differ, and the fewest others, taken in order, that
-    tell apart all rows that differ."""
-    present = dict.fromkeys(key for row in rows for key in row)
-    varying = [key for key in present if len({row.get(key) for row in rows}) > 1]
-    chosen = {key for key in varying if key in overridden}
+    """Return the `planned` keys, the `overridden` ones whose values differ, and the fewest others,
+    taken in order, that tell apart all rows that differ."""
+    ordered = sorted(planned, key=lambda key: (_place(key), key))
+    present = dict.fromkeys([*(key for row in rows for key in row), *ordered])
+    differing = {key for key in present if len({row.get(key) for row in rows}) > 1}
+    varying = [key for key in present if key in differing | planned]
+    chosen = {key for key in varying if key in overridden or key in planned}
 
     def count(chosen: set[str]) -> int:
         return len({tuple(row.get(key) for key in varying if key in chosen) for row in rows})

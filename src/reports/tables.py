@@ -241,8 +241,6 @@ def _describe_measurement(
     clips, sizes, devices = (" or ".join(map(str, sorted(values))) for values in found)
     seeds = {frozenset(run.test_seed for run in group.runs) for group in groups if group.runs}
     unlike = " Rows differ in the seed of their test clips." if len(seeds) > 1 else ""
-    if older := sum(group.older for group in groups):
-        unlike += f" {older} older runs of the same seeds are left out."
     if len({group.test_conditions for group in groups if group.runs}) > 1:
         unlike += " Bold: the best of the rows with equal scene, turbulence, sensor and clips."
     cost = f"; ms and GMAC of one frame of {sizes}, {devices}" if with_cost else ""

@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from src.metrics.bootstrap import RESAMPLES, bootstrap_difference_interval, bootstrap_interval
+from src.metrics.bootstrap import (
+    RESAMPLES,
+    bootstrap_difference_interval,
+    bootstrap_interval,
+    compute_coverage,
+)
 
 
 def test_the_interval_of_many_values_is_the_normal_one():
@@ -39,6 +44,21 @@ def test_of_one_seed_it_holds_the_mean_as_often_as_it_says(clips, stated):
         low, high = bootstrap_interval((0.5 + rng.normal(size=clips)).tolist())
         held += low <= 0.5 <= high
     assert held / 400 == pytest.approx(stated, abs=0.03)
+
+
+@pytest.mark.parametrize("clips", [2, 3, 4, 6, 9, 12, 19, 27])
+def test_how_often_it_holds_the_mean_is_what_is_computed(clips):
+    rng, held = np.random.default_rng(1), 0
+    for _ in range(1000):
+        low, high = bootstrap_interval((0.5 + rng.normal(size=clips)).tolist())
+        held += low <= 0.5 <= high
+    assert compute_coverage(clips) == pytest.approx(held / 1000, abs=0.03)
+
+
+def test_of_many_clips_it_holds_the_mean_in_95_of_100_cases_and_one_has_none():
+    assert compute_coverage(10_000) == pytest.approx(0.95, abs=0.001)
+    with pytest.raises(ValueError, match="groups must be >= 2, got 1"):
+        compute_coverage(1)
 
 
 def test_of_three_seeds_it_holds_the_difference_as_often_as_it_says():

@@ -3,6 +3,7 @@
 import pytest
 import skimage
 import torch
+from scipy import ndimage
 from torch.nn import functional
 
 from src.metrics.temporal import estimate_block_displacement, temporal_jitter_px
@@ -51,6 +52,17 @@ def test_jitter_of_a_known_swing(amplitude):
 def test_noise_and_blur_hardly_jitter():
     noise = 0.03 * torch.randn(FRAMES, 1, SIDE, SIDE, generator=torch.Generator().manual_seed(0))
     assert float(temporal_jitter_px(photo(STILL, blur=1.0) + noise, photo(STILL)).mean()) < 0.2
+
+
+@pytest.mark.parametrize(
+    ("speed", "sigma_px", "read_px"),
+    [(1, 2, 0.1), (1, 4, 0.3), (3, 2, 0.3), (3, 4, 0.7), (0, 4, 0.0)],
+)
+def test_blur_of_what_moves_reads_as_it_says(speed, sigma_px, read_px):
+    target = photo(speed * torch.arange(FRAMES)[:, None] * torch.tensor([[0.7, 0.3]]))
+    blurred = torch.from_numpy(ndimage.gaussian_filter(target.numpy(), (0, 0, sigma_px, sigma_px)))
+    jitter = temporal_jitter_px(blurred, target).mean()
+    assert float(jitter) == pytest.approx(read_px, abs=0.05)
 
 
 def test_motion_that_is_in_the_truth_is_no_jitter():

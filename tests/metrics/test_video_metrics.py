@@ -107,7 +107,8 @@ def test_pairs_of_frames_without_texture_have_no_jitter():
     assert VideoMetrics()(torch.rand_like(ramp), ramp)["temporal_jitter_px"] is None
 
 
-def test_a_network_s_own_nan_is_a_score():
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_a_network_s_own_frames_of_no_numbers_have_the_score_nan(value):
     frames, target = moving_pair()
-    scores = VideoMetrics()(torch.full_like(frames, torch.nan), target)
-    assert all(math.isnan(scores[name]) for name in ("psnr_aligned", "temporal_jitter_px"))
+    scores = VideoMetrics()(torch.full_like(frames, value), target)
+    assert all(map(math.isnan, scores.values())) and len(scores) == 4

@@ -14,7 +14,7 @@ from src.reports.differences import build_difference_table, compare_clips, pool_
 from src.reports.pairs import build_pair_table
 from src.reports.tables import METRICS, TableCell
 from src.reports.writers import format_cell, format_csv_tables, format_markdown
-from tests.reports.runs import SCORES, write_run
+from tests.reports.runs import SCORES, write_run, write_sweep
 from tests.test_train import config
 
 PAPER = {"source": "paper", "rows": [
@@ -42,13 +42,21 @@ def test_differences_are_ours_minus_theirs_with_an_interval(tmp_path):
     assert table.rows[1][-1].text == "-"
 
 
-def test_clips_of_other_seeds_are_further_clips(tmp_path):
+@pytest.mark.parametrize("other", ["cd", "ef"])  # photographs of another seed have other names
+def test_clips_of_other_seeds_are_further_clips(other, tmp_path):
     """Not the same clips in another training, of which the means vary independently."""
-    ours = found(tmp_path, "a", {"c": 2.0, "d": 5.0}, {"c": 1.0, "d": 9.0}, have_own_clips=True)
-    theirs = found(tmp_path, "b", {"c": 1.0, "d": 4.0}, {"c": 0.0, "d": 8.0}, have_own_clips=True)
+    values = {"a": ((2.0, 5.0), (1.0, 9.0)), "b": ((1.0, 4.0), (0.0, 8.0))}
+    ours, theirs = (
+        found(tmp_path, side, dict(zip("cd", first, strict=True)),
+              dict(zip(other, second, strict=True)), have_own_clips=True)
+        for side, (first, second) in values.items()
+    )  # fmt: skip
     table = build_difference_table("", ours, theirs, PAPER)
     assert table.rows[0][3].text == "+1.0000" and table.rows[0][4].text == "+1.0000 to +1.0000"
     assert table.note.startswith("4 clips; 2 runs against 2.")
+    theirs[1].clips[0]["name"] = "another"
+    with pytest.raises(ValueError, match="must hold the same clips, got 2 sets"):
+        build_difference_table("", ours, theirs, PAPER)
 
 
 def test_clips_of_a_seed_that_one_side_lacks_are_left_out_and_it_is_said(tmp_path):
@@ -147,6 +155,22 @@ def test_pairs_of_a_sweep_are_subtracted_clip_by_clip(tmp_path):
     assert first.startswith("Pairs,")
 
 
+def test_intervals_over_few_scenes_say_how_often_they_hold_the_mean(tmp_path):
+    few, many = (dict.fromkeys(map(str, range(count)), 0.3) for count in (12, 20))
+    sides = [found(tmp_path, name, few) for name in ("a", "b")]
+    said = " Of {} photographs or scenes such a CI holds one seed's mean in "
+    note = build_difference_table("", *sides, PAPER).note
+    assert said.format(12) + "about 91 % of cases." in note
+    keys, groups = run_groups.group_runs([run for side in sides for run in side])
+    assert build_pair_table("", keys, groups, [("a", "b")]).note.count(said.format(12)) == 1
+    for number, clip in enumerate(sides[0][0].clips):
+        clip["source"] = str(number // 4)
+    note = build_difference_table("", *sides, PAPER).note
+    assert said.format(3) + "about 75 % of cases." in note
+    larger = [found(tmp_path, name, many) for name in ("c", "d")]
+    assert "scenes" not in build_difference_table("", *larger, PAPER).note
+
+
 def test_a_pair_with_a_run_missing_is_a_row_that_says_so(tmp_path):
     sweep(tmp_path)
     shutil.rmtree(tmp_path / "one" / "strong")
@@ -155,6 +179,37 @@ def test_a_pair_with_a_run_missing_is_a_row_that_says_so(tmp_path):
     text = format_markdown([table])
     assert "| strong | lf3x3 − one | missing |" in text
     assert "| weak | lf3x3 − one | -0.015 (-0.050 to +0.020) |" in text
+
+
+def test_jobs_of_a_stopped_sweep_do_not_stand_for_those_that_ended(tmp_path):
+    sweep(tmp_path)
+    shutil.rmtree(tmp_path / "lf3x3" / "strong")
+    shutil.rmtree(tmp_path / "one" / "strong")
+    given = {"experiment": "x", "seed": "0", "method": "lf3x3,one", "turbulence": "weak,strong"}
+    write_sweep(tmp_path, given)
+    plans = runs.find_sweeps([tmp_path])
+    keys, groups = run_groups.group_runs(runs.find_runs([tmp_path]), plans)
+    text = format_markdown([build_pair_table("", keys, groups, [("lf3x3", "one")], ["lpips"])])
+    assert "| weak | lf3x3 − one | -0.015 (-0.050 to +0.020) |" in text
+    assert "| strong | lf3x3 − one | missing |" in text
+
+
+@pytest.mark.parametrize("missing_last", [False, True])
+def test_a_group_without_runs_never_replaces_one_with_runs(missing_last, tmp_path):
+    keys, groups = run_groups.group_runs(sweep(tmp_path))
+    missing = [run_groups.RunGroup(group.label, [], missing=1) for group in groups]
+    both = [*groups, *missing] if missing_last else [*missing, *groups]
+    table = build_pair_table("", keys, both, [("lf3x3", "one")], ["lpips"])
+    assert "missing" not in format_markdown([table])
+
+
+def test_older_runs_that_pairs_leave_out_are_in_the_note(tmp_path):
+    found = sweep(tmp_path)
+    tests = [replace(run, folder=run.folder / "again") for run in found[:1]]
+    keys, groups = run_groups.group_runs([*found, *tests])
+    both = [("lf3x3", "one"), ("one", "lf3x3")]
+    note = build_pair_table("", keys, groups, both, ["lpips"]).note
+    assert "1 older runs of the same seeds are left out." in note
 
 
 def test_pairs_without_results_of_both_are_refused_and_the_page_stays(tmp_path):

@@ -167,6 +167,22 @@ def test_jobs_of_the_sweep_without_results_are_missing_in_its_order(tmp_path):
     ]
 
 
+def test_what_tells_jobs_apart_is_in_the_label_before_they_have_ended(tmp_path):
+    given = {"experiment": "x", "threshold": "0.1,0.7", "method": "a,b", "data.test_seed": "0,1"}
+    write_sweep(tmp_path, given | {"seed": "0"})
+    for method in "ab":
+        asked = ("threshold=0.1", f"method={method}", "data.test_seed=0")
+        settings = {"threshold": 0.1, "data": {"test_seed": 0}}
+        choices = {"method": method}
+        more = {"settings": settings, "overrides": asked, "choices": choices, "task": "eval"}
+        write_run(tmp_path / method, "x", **more)
+        keys, found = grouped(tmp_path)
+        assert keys == ("method", "threshold")
+        done = {group.label for group in found if group.runs}
+        assert done == {("a", "0.1"), ("b", "0.1")} if method == "b" else {("a", "0.1")}
+        assert {group.label for group in found} == {(m, t) for m in "ab" for t in ("0.1", "0.7")}
+
+
 def test_a_plan_is_the_command_and_its_jobs(tmp_path):
     write_sweep(tmp_path, {"experiment": "a,b", "seed": "range(2)"}, ("budget=hour", "seed=7"))
     (plan,) = runs.find_sweeps([tmp_path])
