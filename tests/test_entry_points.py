@@ -78,22 +78,20 @@ def test_a_wrong_value_is_one_line_and_exit_code_2_of_the_process(tmp_path):
 
 
 @pytest.mark.parametrize("below", ["", "/run"])
-def test_a_file_where_the_folder_of_a_run_should_be_is_one_line(below, tmp_path):
+def test_a_file_where_the_folder_of_a_run_should_be_is_one_line(below, tmp_path, capsys):
     (tmp_path / "notes.txt").write_text("kept")
     folder = f"{tmp_path}/notes.txt{below}"
-    line = [sys.executable, "-m", "src.report", "run=out", f"hydra.run.dir={folder}"]
-    done = subprocess.run(line, cwd=ROOT, capture_output=True, text=True)
     wanted = f"hydra.run.dir must be a folder, new or there, got {folder}: a file is in the way"
-    assert (done.returncode, done.stderr.strip()) == (2, f"error: {wanted}")
+    assert run_here("report", "run=out", f"hydra.run.dir={folder}") == 2
+    assert capsys.readouterr().err.strip() == f"error: {wanted}"
     assert (tmp_path / "notes.txt").read_text() == "kept"
 
 
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="needs Linux")
-def test_a_folder_of_a_run_that_cannot_be_made_is_one_line():
-    line = [sys.executable, "-m", "src.report", "run=out", "hydra.run.dir=/proc/nope"]
-    done = subprocess.run(line, cwd=ROOT, capture_output=True, text=True)
+def test_a_folder_of_a_run_that_cannot_be_made_is_one_line(capsys):
     wanted = "hydra.run.dir must be a folder, new or there, got /proc/nope: it cannot be made there"
-    assert (done.returncode, done.stderr.strip()) == (2, f"error: {wanted}")
+    assert run_here("report", "run=out", "hydra.run.dir=/proc/nope") == 2
+    assert capsys.readouterr().err.strip() == f"error: {wanted}"
 
 
 @pytest.mark.parametrize("command", [["-m", "src.train"], ["-m", "lightfield_events", "train"]])

@@ -186,3 +186,20 @@ def test_profiles_by_name_and_by_table():
     assert unnormalised_cn2_profile([0, 2.5]) == (0.0, 2.5)
     path = sample_atmosphere("medium", generator(0), cn2_profiles=[[0.0, 1.0, 3.0]])
     assert path.cn2_profile[2] == pytest.approx(3 * path.cn2_profile[1])
+
+
+def test_what_cameras_show_is_tried_once_for_the_same_settings(monkeypatch):
+    tried, draw = [], prior_trial.draw_atmosphere_once
+
+    def count(*given, **settings):
+        tried.append(settings)
+        return draw(*given, **settings)
+
+    monkeypatch.setattr(prior_trial, "draw_atmosphere_once", count)
+    given = {"severity": "weak", "distance_m": [321.0, 4321.0]}
+    SimulatedTurbulence(given | {"tilt_and_blur_px": {"weak": [1, 2]}})
+    once = len(tried)
+    SimulatedTurbulence(given | {"tilt_and_blur_px": {"weak": (1.0, 2.0)}})
+    assert once > 0 and len(tried) == once
+    SimulatedTurbulence(given | {"tilt_and_blur_px": {"weak": [1, 3]}})
+    assert len(tried) == 2 * once
