@@ -40,7 +40,7 @@ class CISTA(CentreViewNetwork):
         both, code = 2 * channels, 4 * channels
         self.events, self.previous = _conv(bins, channels), _conv(1, channels)
         self.mix = _conv(both, both, stride=2)
-        self.code = _conv(both, code)
+        self.encode = _conv(both, code)
         self.steps = nn.ModuleList(ISTAStep(both, code) for _ in range(steps))
         self.agree_before, self.agree_now = _conv(code, 1), _conv(code, 1)
         self.pulls = nn.ParameterList(1e-3 * torch.rand(1, code, 1, 1) for _ in range(steps))
@@ -59,8 +59,14 @@ class CISTA(CentreViewNetwork):
         frame = self.pred(self.up(upsampled))
         return frame, (z, memory, self.activate_output(frame).detach())
 
+    def state_sizes(self, grid: Tensor) -> list[tuple[int, ...]]:
+        n, _, height, width = grid.shape
+        code, hidden = self.encode.out_channels, self.decoder.out_channels
+        coarse = [(n, channels, height // 2, width // 2) for channels in (code, hidden, hidden)]
+        return [*coarse, (n, 1, height, width)]
+
     def _unfold(self, x: Tensor, before: Tensor | None) -> Tensor:
-        z = self.code(x)
+        z = self.encode(x)
         before = torch.zeros_like(z) if before is None else before
         agreed = self.agree_before(before)
         for step, pull in zip(self.steps, self.pulls, strict=True):

@@ -5,7 +5,7 @@ from typing import Any
 from torch import Tensor
 
 from baselines.centre_view import CentreViewNetwork
-from src.models.e2vid import E2VID
+from src.models.e2vid import E2VID, SCALES
 
 
 class E2VIDPlus(CentreViewNetwork):
@@ -13,6 +13,8 @@ class E2VIDPlus(CentreViewNetwork):
 
     As published: normalise none, output clip.  E2VID itself is normalise nonzero, output sigmoid.
     """
+
+    side_multiple = 2**SCALES
 
     def __init__(
         self, bins: int = 5, base_channels: int = 32, normalise: str = "none", output: str = "clip"
@@ -22,3 +24,6 @@ class E2VIDPlus(CentreViewNetwork):
 
     def predict_before_activation(self, grid: Tensor, state: Any) -> tuple[Tensor, Any]:
         return self.net(grid[:, None], state)
+
+    def state_sizes(self, grid: Tensor) -> list[tuple[int, ...]]:
+        return self.net.state_sizes(grid)

@@ -46,6 +46,9 @@ class ETNet(CentreViewNetwork):
         head, skips, after = self.net.encode(self.net.first_layer(grid), state)
         return self.net.decode_logits(self.pyramid(skips[::-1]), head, skips), after
 
+    def state_sizes(self, grid: Tensor) -> list[tuple[int, ...]]:
+        return self.net.state_sizes(grid)
+
 
 class TokenPyramidAggregation(nn.Module):
     """Tokens of each scale attend to themselves and to the next coarser scale.

@@ -34,3 +34,6 @@ class FireNet(CentreViewNetwork):
             x = block(x)
             after.append(new)
         return self.pred(x), tuple(after)
+
+    def state_sizes(self, grid: Tensor) -> list[tuple[int, ...]]:
+        return [(len(grid), self.head.out_channels, *grid.shape[2:])] * len(self.cells)

@@ -7,8 +7,10 @@ from collections.abc import Sequence
 from jaxtyping import Float
 from torch import Tensor
 
-from src.models.network import WINDOW_S, EventToVideoNetwork
-from src.sim.optics import Position, layout, most_central_view_index
+from baselines.centre_view import find_centre_view
+from src.models.layers import check_state_sizes
+from src.models.network import WINDOW_S, EventToVideoNetwork, check_voxel_shape
+from src.sim.optics import Position
 
 
 class HighPass(EventToVideoNetwork):
@@ -35,11 +37,17 @@ class HighPass(EventToVideoNetwork):
         window_s: float | Tensor = WINDOW_S,
         positions: Sequence[Position] | None = None,
     ) -> tuple[Float[Tensor, "n 1 h w"], Tensor]:
-        """Return the frame in [0, 1] and the leaky sum (n, 1, h, w)."""
+        """Return the frame in [0, 1] and the leaky sum (n, 1, h, w).
+
+        Raises ValueError for another shape or number of positions, and for a state of other sizes.
+        """
+        check_voxel_shape(voxels)
         events = voxels.sum(2)
         if self.view_reduction == "centre":
-            change = events[:, most_central_view_index(positions or layout(events.shape[1])), None]
+            change = events[:, find_centre_view(events.shape[1], positions), None]
         else:
             change = events.median(dim=1, keepdim=True).values
+        if state is not None:
+            check_state_sizes(state, [tuple(change.shape)])
         state = change if state is None else self.decay * state + change
         return (0.5 + self.gain * state).clamp(0, 1), state

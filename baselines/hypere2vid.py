@@ -47,6 +47,9 @@ class HyperE2VID(CentreViewNetwork):
         frame = self.net.decode_logits(x, head, skips)
         return frame, (after, frame.detach())
 
+    def state_sizes(self, grid: Tensor) -> list[tuple[int, ...]]:
+        return [*self.net.state_sizes(grid), (len(grid), 1, *grid.shape[2:])]
+
 
 class DynamicDecoder(nn.Module):
     """Doubles the resolution and convolves with kernels that a context chooses pixel by pixel.

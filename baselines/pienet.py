@@ -76,8 +76,18 @@ class PIENet(CentreViewNetwork):
         for decoder in self.decoders:
             x = decoder(x, skips.pop(), state.variance, state.begun)
         frame, variance = self._map_to_intensity(self.pred(x))
-        carried = frame.detach().clamp(0, 1), variance.detach(), torch.ones_like(state.begun)
+        shown = frame.detach().relu().clamp(max=1)  # ONNX's exporter drops the second clamp(0, 1)
+        carried = shown, variance.detach(), torch.ones_like(state.begun)
         return frame, PIENetState(tuple(memories), *carried)
+
+    def state_sizes(self, grid: Tensor) -> list[tuple[int, ...]]:
+        n, _, height, width = grid.shape
+        sizes, side = [], [height, width]
+        for encoder in self.encoders:
+            assert isinstance(encoder, FiLMConvLSTM)
+            sizes += [(n, encoder.width, *side)] * 2
+            side = [length // min(encoder.pool, *side) for length in side]
+        return [*sizes, *[(n, 1, height, width)] * 2, (n, 1, 1, 1)]
 
     def _map_to_intensity(self, maps: Float[Tensor, "n 3 h w"]) -> tuple[Tensor, Tensor]:
         """Return frame and variance of mean and variance of the change and the refined frame."""

@@ -73,7 +73,7 @@ CISTA_TC = (
     (r"^events\.", "We.conv2d."),
     (r"^previous\.", "Wi.conv2d."),
     (r"^mix\.", "W0.conv2d."),
-    (r"^code\.", "P0.conv2d."),
+    (r"^encode\.", "P0.conv2d."),
     (r"^steps\.(\d)\.threshold", r"lista_blocks.\1.Lambda"),
     (r"^steps\.(\d)\.synthesis\.", r"lista_blocks.\1.D.conv2d."),
     (r"^steps\.(\d)\.analysis\.", r"lista_blocks.\1.P.conv2d."),

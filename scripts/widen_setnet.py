@@ -130,7 +130,7 @@ def begin(cfg: DictConfig) -> None:
         got = f"{cfg.ckpt} and {cfg.export}"
         raise ValueError(f"ckpt and export must be files, export a .safetensors, got {got}")
     wide, spec = build.build_untrained_network(cfg)
-    source = Path(cfg.ckpt)
+    source = files.locate(cfg.ckpt)
     old = files.load(source)
     if not (isinstance(old, SetNet) and isinstance(wide, SetNet)):
         kinds = f"{type(old).__name__} to {type(wide).__name__}"

@@ -267,6 +267,9 @@ def test_a_size_begins_as_a_smaller_one_with_its_hours(tmp_path):
     for wrong in ("ckpt=null", "experiment=lf3x3"):
         with pytest.raises(ValueError, match="ckpt and ex"):
             widen_setnet.begin(config("train", tmp_path, *TINY, *given, wrong))
+    shipped = "experiment=setnet_medium", "ckpt=setnet_small", f"export={export}"
+    widen_setnet.begin(config("train", tmp_path, *TINY, *shipped))
+    assert files.read_card(export)["hours"] == pytest.approx(14.99, abs=0.01)  # of its card
 
 
 def test_areas_are_learned_from_what_is_held():

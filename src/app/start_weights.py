@@ -1,25 +1,33 @@
 """The weights that a training begins from, and the networks that it is compared with at its end."""
 
+import sys
 import warnings
 from pathlib import Path
+from typing import Any
 
+import torch
 from omegaconf import DictConfig, OmegaConf
 
-from src.app import entry_point, methods
+from src.app import build, entry_point, methods
 from src.app.instantiate import as_dict
 from src.models import files
 from src.models.checkpoints import newest_checkpoint
+from src.models.e2vid import E2VID
 from src.models.network import VideoMethod
 from src.records import safe_yaml
+
+UNIT_NORM_TOLERANCE = 0.05  # of gates trained with spectral norm, whose estimate lags behind
 
 
 def set_model_from_start_weights(cfg: DictConfig) -> Path | None:
     """Return the file that `start` names, None for a training from nothing, and make `cfg.model`
-    its network: width, stem and all that follows from the weights.
+    its network: width, stem and all that follows from the weights; `model.spectral_norm` stays, of
+    weights that have it or where it is typed, as files hold it folded.
 
     Where `ckpt` goes on, the `start` of budget=fine_tuning gives way to what `ckpt` began from; one
     that is typed stays.  An E2VID on one view is given those of `optics`.  Raises ValueError for a
-    file that is not there or holds weights of another class, number of bins or number of views.
+    file that is not there or holds weights of another class, number of bins or number of views,
+    and for other values of the network that are typed.
     """
     if (
         cfg.start not in (None, "none")
@@ -47,9 +55,56 @@ def set_model_from_start_weights(cfg: DictConfig) -> Path | None:
         views = cfg.optics.views
         if kwargs.get("views", 1) not in (1, views):
             raise ValueError(f"start must be weights of 1 or {views} views, got {kwargs['views']}")
-        kwargs["views"] = views
+        kwargs |= {"views": views, "spectral_norm": _keeps_spectral_norm(cfg, path)}
+    _refuse_other_typed_values(cfg, kwargs)
     OmegaConf.update(cfg, "model", {"_target_": got, **kwargs}, merge=False)
     return path
+
+
+@torch.no_grad()
+def _keeps_spectral_norm(cfg: DictConfig, path: Path) -> bool:
+    """Return `model.spectral_norm`, but False, with a line, for gates of another norm than one in
+    the file `path` of an E2VID, unless it is typed."""
+    if not cfg.model.get("spectral_norm"):
+        return False
+    network = files.load(path)
+    assert isinstance(network, E2VID)
+    norms = [float(torch.linalg.matrix_norm(gate.weight.flatten(1), 2)) for gate in network.gates]
+    unlike = max(norms, key=lambda norm: abs(norm - 1))
+    is_kept = abs(unlike - 1) <= UNIT_NORM_TOLERANCE
+    if is_kept or entry_point.is_set_on_command_line("model.spectral_norm"):
+        return True
+    print(f"start has gates of norm {unlike:.3g}: model.spectral_norm=false", file=sys.stderr)
+    return False
+
+
+def _refuse_other_typed_values(cfg: DictConfig, kwargs: dict[str, Any]) -> None:
+    """Raise ValueError for a key of `model`, or one that it follows, that the command line sets to
+    another value than the network of `start` has, which `kwargs` build."""
+    for name, value in as_dict(cfg.model).items():
+        key = _find_typed_key(cfg, name)
+        if key is None or name == "_target_":
+            continue
+        if name in kwargs and value != kwargs[name]:
+            raise ValueError(f"{key} must be {kwargs[name]}, as in start={cfg.start}, got {value}")
+        if name not in kwargs and _network_arguments(cfg) != kwargs:
+            wanted = f"{key} must be that of start={cfg.start}"
+            raise ValueError(f"{wanted}, got {name} = {value}")
+
+
+def _find_typed_key(cfg: DictConfig, name: str) -> str | None:
+    """Return the key on the command line that sets the argument `name` of `model`: its own, that of
+    `${...}`, the choice of a preset; None without one."""
+    written = OmegaConf.to_container(cfg.model, resolve=False)
+    assert isinstance(written, dict)
+    keys = [f"model.{name}", str(written[name]).removeprefix("${").removesuffix("}")]
+    keys += ["model"] if cfg.model._target_.endswith(".preset") else []
+    return next((key for key in keys if entry_point.is_set_on_command_line(key)), None)
+
+
+def _network_arguments(cfg: DictConfig) -> dict[str, Any]:
+    with torch.random.fork_rng(devices=[]):  # it begins with random weights
+        return build.build_untrained_network(cfg)[1]["kwargs"]
 
 
 def _find_start_of(ckpt: str) -> str:

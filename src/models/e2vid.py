@@ -16,9 +16,14 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils.parametrizations import spectral_norm as normalise_spectrum
-from torch.utils import _pytree as pytree
 
-from src.models.layers import ConvGRU, ConvLSTM, ResidualBlock, pad_centred_to_multiple
+from src.models.layers import (
+    ConvGRU,
+    ConvLSTM,
+    ResidualBlock,
+    check_state_sizes,
+    pad_centred_to_multiple,
+)
 from src.models.network import (
     WINDOW_S,
     EventToVideoNetwork,
@@ -86,7 +91,7 @@ class E2VID(EventToVideoNetwork):
         self.pred = nn.Conv2d(base_channels, 1, 1)
         self.relu = nn.ReLU()
         if spectral_norm:
-            for gate in (m for c in self.cells for m in c.children()):
+            for gate in self.gates:
                 normalise_spectrum(gate)
 
     def forward(
@@ -161,15 +166,22 @@ class E2VID(EventToVideoNetwork):
         """Raise ValueError unless `state` has the sizes that padded voxels `x` leave."""
         if not state:
             return
-        found = [tuple(getattr(leaf, "shape", ())) for leaf in pytree.tree_leaves(state)]
+        check_state_sizes(state, self.state_sizes(x))
+
+    def state_sizes(self, x: Float[Tensor, "n c h w"]) -> list[tuple[int, ...]]:
+        """Return the sizes of the state's tensors, in order, that padded voxels `x` leave."""
         n, _, height, width = x.shape
-        sizes = []
+        sizes: list[tuple[int, ...]] = []
         for scale, cell in enumerate(self.cells, start=1):
             channels = self.encoders[scale - 1].out_channels
-            size = n, channels, height // 2**scale, width // 2**scale
+            size: tuple[Any, ...] = n, channels, height // 2**scale, width // 2**scale
             sizes += [size] * (2 if isinstance(cell, ConvLSTM) else 1)
-        if found != sizes:
-            raise ValueError(f"state must have sizes {sizes} for these voxels, got {found}")
+        return sizes
+
+    @property
+    def gates(self) -> list[nn.Conv2d]:
+        """The convolutions of the cells, whose kernels `spectral_norm` keeps at norm one."""
+        return [gate for cell in self.cells for gate in cell.children()]  # type: ignore[misc]
 
     @property
     def first_layer(self) -> nn.Conv2d:

@@ -5,7 +5,7 @@ from the key of the sample, so a batch is the same in any worker.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from jaxtyping import Bool, Int
@@ -48,7 +48,8 @@ class Augment:
     batch_centre_view_probability: float = 0.0
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
+        for field in fields(Augment):  # a subclass has others, of ranges of their own
+            name, value = field.name, getattr(self, field.name)
             if name in ("noise_std", "max_view_shift_px"):
                 if not 0 <= value < float("inf"):
                     raise ValueError(f"augment.{name} must be >= 0, got {value}")

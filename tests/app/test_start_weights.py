@@ -1,7 +1,10 @@
 """A training begins as the weights that `start` names, and is compared with `references`."""
 
+import re
+
 import pytest
 import torch
+from torch.nn.utils import parametrize
 
 from src.app import build, entry_point, start_weights
 from src.models import files, load
@@ -23,7 +26,7 @@ def write_weights(path, **other):
 
 @torch.no_grad()
 def test_nine_views_begin_exactly_as_the_shipped_network_on_one(tmp_path):
-    cfg = config("train", tmp_path, "budget=fine_tuning")
+    cfg = config("train", tmp_path, "budget=fine_tuning", "model.spectral_norm=false")
     assert (cfg.start, cfg.width) == ("single256", 8)  # the width is that of the weights
     path = start_weights.set_model_from_start_weights(cfg)
     net, spec = build.build_untrained_network(cfg)
@@ -37,6 +40,71 @@ def test_nine_views_begin_exactly_as_the_shipped_network_on_one(tmp_path):
     assert torch.allclose(ours, theirs, rtol=0, atol=1e-9) and ours.std() > 0.01
     name = start_weights.label_before_training(cfg, path)
     assert name == "single256 given 9 views, before training"
+
+
+@torch.no_grad()
+def test_the_shipped_network_goes_on_with_its_spectral_norm(tmp_path):
+    cfg = config("train", tmp_path, "budget=fine_tuning")
+    path = start_weights.set_model_from_start_weights(cfg)
+    net, spec = build.build_untrained_network(cfg)
+    files.restore_weights(net, path)
+    assert spec["kwargs"]["spectral_norm"] is True
+    assert all(parametrize.is_parametrized(gate, "weight") for gate in net.gates)
+    seen = torch.randn(1, 4, 9, 5, 32, 32)
+    gap = unroll(net.eval(), seen)[0] - unroll(load("single256"), seen[:, :, 4:5])[0]
+    assert gap.abs().max() < 5e-3  # norms of float16, up to 1.0005, are divided out
+
+
+def test_gates_of_another_norm_are_trained_without_unless_it_is_typed(
+    tmp_path, monkeypatch, capsys
+):
+    path = write_weights(tmp_path / "one.safetensors")
+    cfg = config("train", tmp_path, f"start={path}")
+    start_weights.set_model_from_start_weights(cfg)
+    assert cfg.model.spectral_norm is False
+    assert re.search(
+        "start has gates of norm .*: model.spectral_norm=false", capsys.readouterr().err
+    )
+    cfg = type_command(monkeypatch, tmp_path, f"start={path}", "model.spectral_norm=true")
+    start_weights.set_model_from_start_weights(cfg)
+    assert cfg.model.spectral_norm is True
+
+
+def type_command(monkeypatch, tmp_path, *overrides):
+    typed = {"overrides": list(overrides)}
+    monkeypatch.setattr(entry_point, "describe_hydra_command", lambda: typed)
+    return config("train", tmp_path, *overrides)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        (["width=12"], "width must be 16, as in start=single256, got 12"),
+        (["model.base_channels=12"], "model.base_channels must be 16, as in"),
+        (["stem=null"], "stem must be 32, as in start=single256, got None"),
+        (["state_rounding_step=0.5"], "state_rounding_step must be 0.25, as in .*, got 0.5"),
+        (["model.recurrent=convgru"], "model.recurrent must be convlstm, as in .*, got convgru"),
+        (
+            ["experiment=setnet_small", "start=setnet_small", "model=setnet_large"],
+            "model must be that of start=setnet_small, got size = large",
+        ),
+    ],
+)
+def test_a_typed_value_that_the_weights_do_not_have_is_refused(
+    overrides, said, tmp_path, monkeypatch
+):
+    cfg = type_command(monkeypatch, tmp_path, "budget=fine_tuning", *overrides)
+    with pytest.raises(ValueError, match=said):
+        start_weights.set_model_from_start_weights(cfg)
+
+
+def test_a_typed_value_that_the_weights_have_is_taken(tmp_path, monkeypatch):
+    same = ["width=16", "stem=32", "model.recurrent=convlstm", "optics=lf3x3", "model=e2vid"]
+    cfg = type_command(monkeypatch, tmp_path, "budget=fine_tuning", *same)
+    assert start_weights.set_model_from_start_weights(cfg) == files.locate("single256")
+    own = ["experiment=setnet_small", "start=setnet_small", "model.size=small"]
+    cfg = type_command(monkeypatch, tmp_path, *own)
+    assert start_weights.set_model_from_start_weights(cfg) == files.locate("setnet_small")
 
 
 @pytest.mark.parametrize("start", ["none", "null"])

@@ -1,5 +1,7 @@
 """What every frozen network must do, and what is particular to each."""
 
+import jaxtyping
+import numpy as np
 import pytest
 import torch
 from torch.nn import functional
@@ -13,7 +15,7 @@ from baselines.highpass import HighPass
 from baselines.hypere2vid import DynamicDecoder, HyperE2VID, fourier_bessel_functions
 from baselines.pienet import PIENet
 from src.models.network import unroll
-from src.sim.optics import Optics
+from src.sim.optics import Optics, layout
 
 PUBLISHED = {
     FireNet: 37_777,
@@ -116,6 +118,58 @@ def test_it_can_learn_one_batch_by_heart(kind):
 def test_other_bins_are_refused(kind):
     with pytest.raises(ValueError, match="bins must be 3"):
         small(kind)(torch.zeros(1, 1, 5, 24, 24), None)
+
+
+def call_unchecked(network, *args, **options):
+    """Call `network` without the type checks of tests."""
+    jaxtyping.config.update("jaxtyping_disable", True)
+    try:
+        return network(*args, **options)
+    finally:
+        jaxtyping.config.update("jaxtyping_disable", False)
+
+
+@pytest.mark.parametrize("kind", [*PUBLISHED, HighPass])
+@torch.no_grad()
+def test_positions_are_one_for_each_view_of_any_kind_of_array(kind):
+    network = HighPass() if kind is HighPass else small(kind)
+    seen = voxels()[:, 0]
+    frame, _ = network(seen)
+    for array in (torch.tensor(layout(9)), np.array(layout(9))):
+        assert torch.equal(call_unchecked(network, seen, positions=array)[0], frame)
+    with pytest.raises(
+        ValueError, match=r"positions must be 9 \(row, col\) .*, got 1: \[\(0, 0\)\]"
+    ):
+        network(seen, positions=[(0, 0)])
+    with pytest.raises(ValueError, match=r"positions must be 3 \(row, col\) .*, got 9: "):
+        network(seen[:, :3], positions=layout(9))
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.int16])
+@pytest.mark.parametrize("kind", PUBLISHED)
+@torch.no_grad()
+def test_voxels_may_be_of_any_number_type(kind, dtype):
+    network, seen = small(kind), (3 * voxels()[:, 0]).round()
+    assert torch.equal(call_unchecked(network, seen.to(dtype))[0], network(seen)[0])
+
+
+@pytest.mark.parametrize("kind", [*PUBLISHED, HighPass])
+@torch.no_grad()
+def test_a_state_of_another_size_and_grids_without_clips_are_refused(kind):
+    network = HighPass() if kind is HighPass else small(kind)
+    seen = voxels(2, side=42)[:, 0]  # sides that are padded, and pooled with a rest
+    state = network(seen, network(seen)[1])[1]  # fits itself
+    for other in (seen[..., :24], seen[:1]):
+        with pytest.raises(ValueError, match=r"state must have sizes \[\(.* for these voxels, got"):
+            network(other, state)
+    with pytest.raises(ValueError, match=r"voxels must be \(clips, views, bins, height, width\)"):
+        call_unchecked(network, seen[0])
+
+
+def test_cista_is_exported_as_a_graph_of_pytorch():
+    network, seen = small(CISTA), voxels()[:, 0]
+    graph = torch.export.export(network, (seen,)).module()
+    torch.testing.assert_close(graph(seen)[0], network(seen)[0])
 
 
 @torch.no_grad()

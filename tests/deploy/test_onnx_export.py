@@ -11,6 +11,7 @@ import torch
 
 from baselines.firenet import FireNet
 from baselines.highpass import HighPass
+from baselines.pienet import PIENet
 from src.deploy import onnx_export
 from src.deploy.forms import Bf16Network, convert_to_form
 from src.deploy.onnx_export import OnnxNetwork, export_onnx
@@ -59,6 +60,24 @@ def test_onnx_gives_the_frames_of_the_network_window_by_window(name, tmp_path):
         found(noise()[0, :, :3])
     with pytest.raises(ValueError, match="path must be in a folder that is there"):
         export_onnx(network, tmp_path / "none" / "net.onnx", views=9, height=32, width=32)
+
+
+def test_pienet_lite_is_exported(tmp_path):
+    pytest.importorskip("onnxruntime", reason="needs the extra onnx")
+    pytest.importorskip("onnxscript", reason="needs the extra onnx")
+    torch.manual_seed(0)
+    network = PIENet(channels=(16, 24), pools=(2, 2)).eval()
+    found = export_onnx(network, tmp_path / "net.onnx", views=1, height=40, width=40)
+    assert found.views == 1
+
+
+def test_a_file_that_onnx_runtime_cannot_run_is_one_line(tmp_path, monkeypatch):
+    pytest.importorskip("onnxruntime", reason="needs the extra onnx")
+    pytest.importorskip("onnxscript", reason="needs the extra onnx")
+    monkeypatch.setattr(onnx_export, "_write", lambda *given: given[-1].write_bytes(b"none"))
+    with pytest.raises(ValueError, match="FireNet has a part that ONNX Runtime cannot run"):
+        export_onnx(FireNet(), tmp_path / "net.onnx", views=1, height=40, width=40)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("name", NETWORKS)

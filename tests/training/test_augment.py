@@ -2,6 +2,7 @@
 
 import math
 from collections import Counter
+from dataclasses import dataclass
 
 import pytest
 import torch
@@ -34,6 +35,17 @@ def numbered(windows: int = 6, size: int = 4) -> Sample:
     voxels = (window + pixel).expand(1, windows, 2, 3, size, size)
     target = voxels[:, :, 0, :1] / 10
     return Sample(voxels.clone(), target.clone(), target.clone(), torch.tensor([1 / 120]))
+
+
+@dataclass(frozen=True)
+class Scaled(Augment):
+    gain: float = 3.0
+
+
+def test_a_subclass_has_fields_of_any_range():
+    assert Scaled(**OFF).gain == 3
+    with pytest.raises(ValueError, match=r"augment.flip_probability must be in \[0, 1\], got 2"):
+        Scaled(flip_probability=2)
 
 
 def test_nothing_on_changes_nothing():
