@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from src import COMMAND
 from src.models import files
 from src.models.network import FramePostprocessor, VideoMethod
 
@@ -85,7 +86,7 @@ def load_postprocessor(weights: str, allowed_packages: Sequence[str] = ()) -> Fr
     except ValueError as error:
         raise ValueError(
             "postprocess.postprocessor must be a name in weights/ or a path, got "
-            f"{weights} ({error}); make one with `python -m src.train experiment=mambatm` and "
+            f"{weights} ({error}); make one with `{COMMAND}train experiment=mambatm` and "
             "scripts.ship_weights"
         ) from error
     if not isinstance(network, FramePostprocessor):

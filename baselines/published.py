@@ -14,6 +14,7 @@ from baselines.firenet import FireNet
 from baselines.hypere2vid import HyperE2VID
 from baselines.pickled_weights import read_pickled_tensors
 from baselines.pienet import PIENet
+from src import COMMAND
 from src.models import files
 
 # Ours -> published, one rule after the other.
@@ -166,7 +167,7 @@ def load_pretrained(architecture: str, weights: str | None) -> nn.Module:
         return network
     if path.is_file():
         return load_published(architecture, path)
-    command = f"`python -m src.train experiment=clean/{architecture}`"
+    command = f"`{COMMAND}train experiment=clean/{architecture}`"
     make = f"make ours with {command} and ship_weights, " if path.parent.name == "clean" else ""
     raise ValueError(
         f"baseline.weights must be a file with the weights of {architecture}, got {weights}; {make}"

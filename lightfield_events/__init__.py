@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from src.app.python_interface import SimulatedClip, simulate
+    from src.deploy.forms import convert_to_form
+    from src.deploy.onnx_export import OnnxNetwork, export_onnx
     from src.deploy.runtime import EventListRuntime as Runtime
     from src.models import load
     from src.recordings.files import ReadOptions, read_events
@@ -19,10 +21,13 @@ if TYPE_CHECKING:
     from src.sim.voxel import voxel_grid
 
 _HOMES = {  # of each name: its module, and there its name
+    "OnnxNetwork": "src.deploy.onnx_export.OnnxNetwork",
     "ReadOptions": "src.recordings.files.ReadOptions",
     "Runtime": "src.deploy.runtime.EventListRuntime",
     "SimulatedClip": "src.app.python_interface.SimulatedClip",
     "Views": "src.recordings.views.Views",
+    "convert_to_form": "src.deploy.forms.convert_to_form",
+    "export_onnx": "src.deploy.onnx_export.export_onnx",
     "layout": "src.sim.optics.layout",
     "load": "src.models.load",
     "load_views": "src.recordings.views.load_views",
@@ -32,8 +37,9 @@ _HOMES = {  # of each name: its module, and there its name
     "write_video": "src.recordings.output.write_video",
 }
 __all__ = [
-    "ReadOptions", "Runtime", "SimulatedClip", "Views", "layout", "load", "load_views",
-    "read_events", "simulate", "voxel_grid", "write_video",
+    "OnnxNetwork", "ReadOptions", "Runtime", "SimulatedClip", "Views", "convert_to_form",
+    "export_onnx", "layout", "load", "load_views", "read_events", "simulate", "voxel_grid",
+    "write_video",
 ]  # fmt: skip
 
 

@@ -10,6 +10,7 @@ os.environ.setdefault("OPENCV_IO_MAX_IMAGE_PIXELS", str(2**27))
 # Before the names src.* and baselines.* of configs and weights: "lightfield_events." where this is
 # installed in that package (setup.py), else nothing.
 HOME = __name__.removesuffix("src")
+COMMAND = "lightfield-events " if HOME else "python -m src."  # what begins a command line
 
 
 def add_package_prefix(name: str) -> str:

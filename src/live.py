@@ -81,7 +81,7 @@ def load_offered_networks(
             continue
         wanted = "offered_networks must be networks"
         networks[other] = methods.load_network_of_kind(EventToVideoNetwork, cfg, other, wanted)
-    takes_all_views(networks[name], positions)
+    takes_all_views(networks[name], positions, cfg.views)
     return {other: net for other, net in networks.items() if accepts_views(net, positions)}
 
 

@@ -140,7 +140,7 @@ def choose_views(cfg: DictConfig, network: EventToVideoNetwork) -> Views:
     """Return the views of the recording that the network takes."""
     given = cfg.sensor_size, ReadOptions.from_keys(cfg), cfg.resolution
     views = recording_inputs.find_views(cfg.recording, cfg.views, *given)
-    all_of_them = reconstruction.takes_all_views(network, views.positions)
+    all_of_them = reconstruction.takes_all_views(network, views.positions, cfg.views)
     return views if all_of_them else views.select([(0, 0)])
 
 

@@ -16,6 +16,7 @@ from rich.progress import track
 from torch import Tensor
 from yaml import YAMLError
 
+from src import COMMAND
 from src.app import console, entry_point, simulation, user_clip_simulation
 from src.app.renamed_keys import refuse_renamed_keys
 from src.app.user_clip_simulation import SimulatedPart, UserClipSimulation
@@ -177,7 +178,7 @@ def print_files(path: Path, events: np.ndarray, pictures: list[Path]) -> None:
     print(f"pictures: {', '.join(map(str, pictures))}")
     if len(events):
         given = shlex.join([f"recording={path}", f"views={views}"])
-        print(f"next: python -m src.reconstruct {given} ckpt=setnet_small")
+        print(f"next: {COMMAND}reconstruct {given} ckpt=setnet_small")
 
 
 def take_clip_config_from_run(cfg: DictConfig) -> DictConfig:

@@ -14,6 +14,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from omegaconf import DictConfig
 from torch import Tensor
 
+from src import COMMAND
 from src.app import build, entry_point, hardware, start_weights
 from src.app.instantiate import as_dict, build_part
 from src.figures import samples
@@ -101,7 +102,7 @@ def _fit_or_name_bad_clip(cfg: DictConfig, training: Training) -> None:
     except NonFiniteError as error:
         config = f"{Path(cfg.paths.run)}/config.yaml"
         which = f"index={error.clips[0]}{' large=true' if error.is_large else ''}"
-        same = f"python -m src.simulate {shlex.quote(f'like={config}')} split=train {which}"
+        same = f"{COMMAND}simulate {shlex.quote(f'like={config}')} split=train {which}"
         raise ValueError(f"{error}; seed {cfg.seed}; to see the clip: {same}") from error
 
 

@@ -46,6 +46,7 @@ frame = runtime.step(*columns, 0.0, 1 / 120)
 grid = voxel_grid(*columns[:4], t0=0.0, t1=1 / 120, bins=5, height=24, width=32)
 write_video("a.mp4", clip.clean, fps=30)
 np.savez("out.npz", frame=frame, events=len(clip.events), grid=grid.numpy(), views=clip.views)
+assert lightfield_events.OnnxNetwork and "onnxruntime" not in sys.modules
 left = {name.split(".")[0] for name in sys.modules} & {"conf", "weights", "baselines"}
 assert not left and sys.modules["src"] is src and "src.models" not in sys.modules
 """

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import lightfield_events
+from src.deploy.onnx_export import PACKAGES
 from src.recordings.files import videos
 from src.recordings.files.event_writers import write_events
 from src.recordings.output import write_video
@@ -50,8 +51,12 @@ def test_the_page_runs_as_it_stands(tmp_path, monkeypatch):
         write_events(tmp_path / name, events, width=64, height=48)
     assert len(blocks()) >= 7
     space: dict = {}
+    has_onnx = all(map(importlib.util.find_spec, PACKAGES))
     for block in blocks():
-        exec(compile(block, "docs/python.md", "exec"), space)
+        if has_onnx or "export_onnx" not in block:
+            exec(compile(block, "docs/python.md", "exec"), space)
+    if has_onnx:
+        assert np.abs(np.stack(space["written"]) - np.stack(space["frames"][:2])).max() < 1e-3
     clip, frames, fast = (space[name] for name in ("clip", "frames", "fast"))
     assert (
         clip.fps == 30 and clip.clean.shape == (15, 40, 56) and clip.drawn["severity"] == "strong"
@@ -176,6 +181,14 @@ def test_the_notebook_that_trains(run_notebook):
     assert len(found["won"]) == 2 and gain != 0
     assert np.mean(found["won"]) == pytest.approx(gain, abs=1e-6)
     assert f"| {gain:+.3f} |" in (found["OUT"] / "report" / "report.md").read_text()
+
+
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_started_elsewhere_says_so(notebook, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    first, space = "".join(cells(notebook, "code")[0]["source"]), {}
+    with pytest.raises(SystemExit, match="^start it in the folder of the repository, not in /"):
+        exec(compile(first, notebook.stem, "exec"), space)
 
 
 def test_every_setting_that_is_made_small_is_in_a_notebook():

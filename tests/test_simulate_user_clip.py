@@ -1,5 +1,6 @@
 """Your own video and photograph through src.simulate, and the same from Python."""
 
+import inspect
 import re
 import shlex
 import subprocess
@@ -73,6 +74,28 @@ def test_the_default_type_of_tensors_changes_nothing(turbulence):
 def test_overrides_in_one_word_are_refused():
     with pytest.raises(ValueError, match=r"^overrides must be a list .*\['sensor.threshold=1'\]"):
         simulate_arrays(textured(2), fps=30, overrides="sensor.threshold=1")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"overrides": {"sensor.threshold": 1}}, "overrides must be a list of key=value, as in"),
+        ({"overrides": 3}, "overrides must be a list of key=value, as in .*, got 3"),
+        ({"overrides": ["abc"]}, "overrides must each be key=value, got 'abc'"),
+        ({"overrides": [3]}, "overrides must each be key=value, got 3"),
+        ({"seconds": "1"}, "seconds must be a number, got '1'"),
+    ],
+)
+def test_arguments_of_another_kind_are_named(options, message):
+    make = inspect.unwrap(simulate_arrays)  # without the type checks of tests
+    with pytest.raises(ValueError, match=f"^{message}"):
+        make(textured(1)[0], **options)
+
+
+def test_a_masked_photograph_is_refused():
+    masked = np.ma.masked_array(textured(1)[0], True)
+    with pytest.raises(ValueError, match="^photo_or_video must be without a mask, got a masked"):
+        simulate_arrays(masked)
 
 
 def test_parts_are_those_of_the_whole_clip(tmp_path, monkeypatch):

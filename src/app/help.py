@@ -3,6 +3,7 @@
 import re
 from pathlib import Path
 
+from src import COMMAND
 from src.app.compose import CONF, config_choices
 
 CHOICE = re.compile(r"- (?:override )?/?(\w+)(?:@(\w+))?: *([\w/]+)(?: +# *(.*))?")
@@ -17,18 +18,32 @@ def help_text(config: str, usage: str) -> str:
     _, _, body = text.partition("defaults:\n")
     entries = re.match(r"(?: +.*\n)*", body)
     assert entries is not None
-    groups = [line for entry in entries[0].splitlines() if (line := _describe_group(entry.strip()))]
-    keys = body[entries.end() :].strip().replace("???     ", "required")
+    found = [one for entry in entries[0].splitlines() if (one := CHOICE.fullmatch(entry.strip()))]
+    groups = [line for one in found if (line := _describe_group(one))]
+    parts = [body[entries.end() :].strip(), *map(_read_keys_of_its_own, found)]
+    keys = "\n\n".join(filter(None, parts)).replace("???     ", "required")
     chosen = ["Groups (group=choice):", *groups, ""] if groups else []
-    return "\n".join([usage.strip(), "", *chosen, "Keys (key=value):", keys, "", FOOT])
+    use = usage.strip().replace("python -m src.", COMMAND)
+    return "\n".join([use, "", *chosen, "Keys (key=value):", keys, "", FOOT])
 
 
-def _describe_group(entry: str) -> str:
-    """Return the line of an entry of the defaults, "" where it is no choice of the user's."""
-    found = CHOICE.fullmatch(entry)
-    if found is None or found[1] in ("paths", "hydra"):
+def _read_keys_of_its_own(entry: re.Match) -> str:
+    """Return the keys, of the command and not of the group, of a group of one file; "" of others.
+
+    They stand at the end, as `time_unit` and others of `reading` do.
+    """
+    group, _, chosen, _ = entry.groups()
+    if config_choices(group) != [chosen]:
         return ""
-    group, key, chosen, comment = found.groups()
+    package, _, keys = (Path(CONF) / group / f"{chosen}.yaml").read_text("utf-8").partition("\n")
+    return keys.strip() if package == "# @package _global_" else ""
+
+
+def _describe_group(entry: re.Match) -> str:
+    """Return the line of an entry of the defaults, "" where it is no choice of the user's."""
+    group, key, chosen, comment = entry.groups()
     names = [name for name in config_choices(group) if name != chosen]
-    line = f"  {key or group}={chosen}".ljust(28) + f" or {', '.join(names)}" * bool(names)
+    if not names or group in ("paths", "hydra"):
+        return ""
+    line = f"  {key or group}={chosen}".ljust(28) + f" or {', '.join(names)}"
     return line + f"  # {comment}" * bool(comment)

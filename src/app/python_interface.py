@@ -3,8 +3,9 @@
 import math
 import tempfile
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -90,9 +91,7 @@ def simulate(
     for `seconds` of a video and a part of a photograph, and for overrides that are none, are
     arguments, or have no effect here (of `scene`, or of the command line alone).
     """
-    if isinstance(overrides, str):
-        raise ValueError(f"overrides must be a list of words, as in [{overrides!r}], got a str")
-    overrides = list(overrides)
+    overrides = _read_overrides(overrides)
     _refuse_other_overrides(overrides)
     if not isinstance(seed, int | np.integer):
         raise ValueError(f"seed must be a whole number, got {seed}")
@@ -107,6 +106,9 @@ def simulate(
     options = {
         key: one.item() if isinstance(one, np.generic) else one for key, one in options.items()
     }
+    for key, one in options.items():
+        if not (one is None or isinstance(one, Real)):
+            raise ValueError(f"{key} must be a number, got {one!r}")
     if isinstance(photo_or_video, str | Path):
         path = Path(photo_or_video)
         key = "photo" if is_photograph(path) else "video"
@@ -116,6 +118,20 @@ def simulate(
         options |= {"speed_widths_per_s": cfg.speed_widths_per_s, "seed": cfg.seed}
         clip = user_clip.clip_from_array(photo_or_video, white_level=cfg.white_level, **options)
     return simulate_clip(UserClipSimulation(cfg, clip))
+
+
+def _read_overrides(overrides: Any) -> list[str]:
+    """Return the overrides; ValueError unless they are a list of key=value."""
+    if isinstance(overrides, str):
+        raise ValueError(f"overrides must be a list of words, as in [{overrides!r}], got a str")
+    if isinstance(overrides, Mapping) or not isinstance(overrides, Iterable):
+        wanted = "overrides must be a list of key=value, as in ['sensor.threshold=0.3']"
+        raise ValueError(f"{wanted}, got {overrides!r}")
+    words = list(overrides)
+    for word in words:
+        if not (isinstance(word, str) and ("=" in word or word.startswith("~"))):
+            raise ValueError(f"overrides must each be key=value, got {word!r}")
+    return words
 
 
 def _refuse_other_overrides(overrides: Sequence[str]) -> None:

@@ -35,10 +35,16 @@ CHECKED_WINDOWS = 4  # windows over which it is compared
 
 
 def export_onnx(
-    network: EventToVideoNetwork, path: Path, *, views: int, height: int, width: int, bins: int = 5,
-    positions: Sequence[Position] | None = None,
+    network: EventToVideoNetwork, path: Path | str, *, views: int, height: int, width: int,
+    bins: int = 5, positions: Sequence[Position] | None = None,
 ) -> "OnnxNetwork":  # fmt: skip
     """Write `network` to `path`, spectral norm folded; return what runs it, checked against it.
+
+    The file takes `views` views of `bins` bins at `positions` (row, col; None: `layout`), pictures
+    of `height` x `width` pixels and one clip at a time.  Inputs, float32: `voxels` (1, views, bins,
+    h, w), `window_s` (1,) in seconds, where the network uses it, and `state0`, `state1`, ..., zeros
+    for the first window; outputs: `frame` (1, 1, h, w) and `after0`, `after1`, ..., the states for
+    the next.
 
     In each of a few windows of noise both begin with PyTorch's state.  Raises ValueError without
     the packages, for sides below 8, for a network that ONNX cannot express or its runtime not run,
@@ -85,7 +91,7 @@ class OnnxNetwork(EventToVideoNetwork):
     Raises ValueError without the packages and, called, for voxels of another size or type.
     """
 
-    def __init__(self, path: Path, threads: int = 1):
+    def __init__(self, path: Path | str, threads: int = 1):
         require_onnx()
         import onnxruntime
 

@@ -26,16 +26,16 @@ from src.deploy.setnet_tiles import SetNetTiles
 from src.deploy.tile_batches import EagerBackend
 from src.models.e2vid import E2VID
 from src.models.folding import inference_copy
+from src.models.network import LONGEST_WINDOW_S
 from src.models.setnet import SetNet
-from src.sim.optics import Position
+from src.sim.optics import Position, check_positions
+from src.sim.user_values import describe_coarse_times, is_number, read_array
 
 EVENT_LIST_FORMS = ("float32", "bf16", "openvino")
 SIDE_MULTIPLE = 8  # sides are padded to it by reflection, as the networks do
 LEAST_INSIDE = 0.01  # of the events given for a window
 MOST_THREADS = 1024  # a mistyped number of more would end the process without a word
 WINDOW_RANGE_S = 1e-9, 1e12  # beyond, float32 ends
-LONGEST_WINDOW_S = 10.0  # beyond, times are hardly in seconds
-LEAST_TIME_STEPS = 1000  # of the type of `t` in a window
 EDGE_STEPS = 4  # of float64, by which rounding puts an event of an edge outside
 DTYPES = (np.float64, np.int64, np.int64, np.float32, np.int64)  # of t, x, y, p, view
 
@@ -79,7 +79,7 @@ class EventListRuntime:
             how = f"; use load({network!r})" if isinstance(network, str) else ""
             kind = type(network).__name__
             raise ValueError(f"a list of events needs a SetNet or an E2VID, got {kind}{how}")
-        _check_positions(positions)
+        check_positions(positions)
         check_picture_size(height, width)
         check_thread_count(threads)
         self.views, self.size = len(positions), (height, width)
@@ -107,12 +107,12 @@ class EventListRuntime:
 
         Events of one window in order of time, arrays of one length: `t`, `t0`, `t1` in seconds, the
         window of a length in WINDOW_RANGE_S, `x`, `y` in pixels, `view` an index into positions,
-        `p` in {-1, 1} or, as floats, weights; a warning says so, once, where these are 0 and 1
-        alone, as OFF and ON are in some files.
+        `p` in {-1, 1}, of whole numbers never 0, or, as floats, weights; a warning says so, once,
+        where these are 0 and 1 alone, as OFF and ON are in some files.
         Those outside t0 <= t <= t1, but for rounding, have no part in it; a warning says so where
         nearly all are.
         Raises ValueError, and leaves the state, for another window and for events that are out of
-        order, off the sensor or in no view.
+        order, off the sensor or in no view, masked arrays, and tensors that NumPy does not read.
         """
         return self.finish(self.begin(t, x, y, p, view, t0, t1))
 
@@ -166,7 +166,8 @@ class EventListRuntime:
         self.runner.state = state
 
     def _checked(self, t, x, y, p, view, t0, t1) -> list[np.ndarray]:
-        given = [np.asarray(part) for part in (t, x, y, p, view)]
+        columns = {"t": t, "x": x, "y": y, "p": p, "view": view}
+        given = [read_array(name, values) for name, values in columns.items()]
         if len({part.shape for part in given}) != 1 or given[0].ndim != 1:
             shapes = [part.shape for part in given]
             raise ValueError(f"t, x, y, p, view must be of one length, got shapes {shapes}")
@@ -194,11 +195,8 @@ class EventListRuntime:
     def _warn_of_units(self, t: np.ndarray, t0: float, t1: float) -> None:
         if t1 - t0 > LONGEST_WINDOW_S:
             self._warn_once("length", f"a window lasts {t1 - t0:g} s: are t, t0 and t1 in seconds?")
-        if len(t) and t.dtype.kind == "f" and t.dtype.itemsize < 8:
-            step = float(np.spacing(np.abs(t[-1])))
-            if step * LEAST_TIME_STEPS > t1 - t0:
-                said = f"t is {t.dtype}, in steps of {step:g} s at {t[-1]:g} s: float64 resolves it"
-                self._warn_once("steps", said)
+        if said := describe_coarse_times(t, t1 - t0, " s"):
+            self._warn_once("steps", said)
 
     def _warn_of_polarities(self, p: np.ndarray) -> None:
         """Warn of weights that are 0 and 1; others need one pass over them."""
@@ -253,20 +251,11 @@ def check_thread_count(threads: Any) -> None:
 
 
 def _check_window(t0: Any, t1: Any) -> None:
-    ends, (least, most) = [np.asarray(t0), np.asarray(t1)], WINDOW_RANGE_S
-    are_numbers = all(end.ndim == 0 and end.dtype.kind in "iuf" for end in ends)
+    least, most = WINDOW_RANGE_S
+    are_numbers = is_number(t0) and is_number(t1)
     if not are_numbers or not least <= float(t1) - float(t0) <= most:
         wanted = f"t0 < t1 in seconds, {least:g} to {most:g} s apart"
         raise ValueError(f"a window must have {wanted}, got {t0} and {t1}")
-
-
-def _check_positions(positions: Any) -> None:
-    try:
-        fits = all(len(position) == 2 for position in positions)
-    except TypeError:
-        fits = False
-    if not fits:
-        raise ValueError(f"positions must be the (row, col) of each view, got {positions}")
 
 
 def _clip_rounded(t: np.ndarray, t0: float, t1: float) -> np.ndarray:

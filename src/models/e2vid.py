@@ -27,10 +27,17 @@ from src.models.layers import (
 from src.models.network import (
     WINDOW_S,
     EventToVideoNetwork,
+    check_state_alone,
     check_voxel_shape,
     check_window_length,
 )
-from src.sim.optics import Position, is_arranged_as_layout, layout, most_central_view_index
+from src.sim.optics import (
+    Position,
+    check_positions,
+    is_arranged_as_layout,
+    layout,
+    most_central_view_index,
+)
 
 CELLS = {"convlstm": ConvLSTM, "convgru": ConvGRU}
 ACTIVATIONS = {"sigmoid": torch.sigmoid, "none": lambda x: x}
@@ -130,6 +137,7 @@ class E2VID(EventToVideoNetwork):
             raise ValueError(f"positions must be {wanted}, got {list(positions)}")
 
     def _check_number(self, positions: Sequence[Position]) -> None:
+        check_positions(positions)
         if len(positions) != self.views:
             wanted = f"{self.views} (row, col) for this network"
             raise ValueError(f"positions must be {wanted}, got {len(positions)}: {list(positions)}")
@@ -166,6 +174,7 @@ class E2VID(EventToVideoNetwork):
         """Raise ValueError unless `state` has the sizes that padded voxels `x` leave."""
         if not state:
             return
+        check_state_alone(state)
         check_state_sizes(state, self.state_sizes(x))
 
     def state_sizes(self, x: Float[Tensor, "n c h w"]) -> list[tuple[int, ...]]:

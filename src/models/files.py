@@ -17,7 +17,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
-from src import add_package_prefix
+from src import COMMAND, add_package_prefix
 from src.models.checkpoints import is_intact, newest_checkpoint
 from src.models.e2vid import E2VID
 from src.models.folding import fold_parametrizations, inference_copy
@@ -175,14 +175,14 @@ def _exported(path: Path) -> tuple[dict, dict[str, Tensor], dict]:
 
 def _checkpoint(path: Path) -> tuple[dict, dict[str, Tensor]]:
     if not is_intact(path):
-        raise ValueError(f"ckpt must be a checkpoint of src.train that is whole, got {path}")
+        raise ValueError(f"ckpt must be a checkpoint of `{COMMAND}train` that is whole, got {path}")
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
         state = content["state_dict"]
         weights = {n.removeprefix("network."): v for n, v in state.items() if "network." in n}
         return content["network"], weights
     except Exception as error:  # libraries raise all kinds on a broken file
-        raise ValueError(f"ckpt must be a checkpoint of src.train, got {path}") from error
+        raise ValueError(f"ckpt must be a checkpoint of `{COMMAND}train`, got {path}") from error
 
 
 def _build(spec: dict, path: Path, allowed_packages: Sequence[str] = ()) -> nn.Module:

@@ -1,6 +1,7 @@
 """The contract of every network here, and how one is run over a sequence of windows."""
 
 import math
+import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,8 @@ if TYPE_CHECKING:  # a network knows nothing of the simulation; a sample is read
     from src.sim.pipeline import Sample
 
 WINDOW_S = 1 / 120  # default length of a window, that of training
+LONGEST_WINDOW_S = 10.0  # beyond, times are hardly in seconds
+LEAST_SIDE_PX = 4  # of voxels: sides are padded to a multiple of 8 by reflection
 MAX_WINDOWS = 40  # that a network is given at once; more take more memory and no less time
 
 
@@ -99,25 +102,43 @@ class EventToVideoNetwork(VideoMethod):
 
 
 def check_voxel_shape(voxels: Tensor) -> None:
-    """Raise ValueError unless `voxels` is a tensor with the five sides of a window's grids."""
+    """Raise ValueError unless `voxels` is a tensor with the five sides of a window's grids, height
+    and width of LEAST_SIDE_PX or more."""
     if not isinstance(voxels, Tensor):
         raise ValueError(f"voxels must be a tensor, got {type(voxels).__name__}")
     if voxels.ndim != 5:
         wanted = "voxels must be (clips, views, bins, height, width)"
         raise ValueError(f"{wanted}, got {tuple(voxels.shape)}")
+    if min(voxels.shape[-2:]) < LEAST_SIDE_PX:
+        wanted = f"voxels must be {LEAST_SIDE_PX} px or more in height and width"
+        raise ValueError(f"{wanted}, got {tuple(voxels.shape)}")
+
+
+def check_state_alone(state: Any) -> None:
+    """Raise ValueError for the pair (frame, state) that a network returns, given as its state."""
+    is_pair = isinstance(state, tuple) and len(state) == 2
+    if is_pair and isinstance(state[0], Tensor) and not isinstance(state[1], Tensor):
+        raise ValueError("state must be the second of the two that a network returns, got both")
 
 
 def check_window_length(window_s: float | Tensor) -> None:
-    """Raise ValueError unless `window_s` is finite and > 0 seconds; a tensor on a GPU, which would
-    be synchronised, and what is traced are not looked at.
+    """Raise ValueError unless `window_s` is finite and > 0 seconds, and warn of one that is longer
+    than LONGEST_WINDOW_S; a tensor on a GPU, which would be synchronised, and what is traced are
+    not looked at.
     """
+    if torch.compiler.is_compiling():
+        return
     if isinstance(window_s, Tensor):
-        is_traced = torch.jit.is_tracing() or torch.compiler.is_compiling()
-        is_known = window_s.device.type == "cpu" and not is_traced
-        if is_known and not ((window_s > 0) & window_s.isfinite()).all():
-            raise ValueError(f"window_s must be > 0 seconds, got {window_s.tolist()}")
-    elif not torch.compiler.is_compiling() and not 0 < window_s < math.inf:
-        raise ValueError(f"window_s must be > 0 seconds, got {window_s}")
+        if window_s.device.type != "cpu" or torch.jit.is_tracing():
+            return
+        least, longest = window_s.min().item(), window_s.max().item()
+    else:
+        least = longest = window_s
+    if not 0 < least <= longest < math.inf:
+        got = window_s.tolist() if isinstance(window_s, Tensor) else window_s
+        raise ValueError(f"window_s must be > 0 seconds, got {got}")
+    if longest > LONGEST_WINDOW_S:
+        warnings.warn(f"a window lasts {longest:g} s: is window_s in seconds?", stacklevel=2)
 
 
 class FramePostprocessor(nn.Module):

@@ -70,11 +70,16 @@ from src.models.background import REVEALING_EVENTS, blend_background
 from src.models.cell_clock import TRACE_TAU_S, ClockTick, run_clock
 from src.models.context_pyramid import ContextPyramid, smooth_context
 from src.models.layers import EqualDCConv, pad_centred_to_multiple, scan_windows
-from src.models.network import EventToVideoNetwork, check_voxel_shape, check_window_length
+from src.models.network import (
+    EventToVideoNetwork,
+    check_state_alone,
+    check_voxel_shape,
+    check_window_length,
+)
 from src.models.setnet_state import Context, SetNetState
 from src.models.time_gated_memory import TimeGatedMemory
 from src.models.view_kernels import ViewKernels
-from src.sim.optics import REACH, Position, layout
+from src.sim.optics import REACH, Position, check_positions, layout
 
 SIZES: dict[str, dict[str, Any]] = {  # GMAC at 176 x 176, 9 views, context included: 0.34, 1.2, 3.5
     "small": {"channels": 16, "context_channels": [32, 64, 96]},
@@ -294,6 +299,7 @@ class SetNet(EventToVideoNetwork):
             allowed = f"in 1..{MAX_VIEWS} (in commands: optics.views)"
             raise ValueError(f"views must be {allowed}, got {views}")
         positions = layout(views) if positions is None else positions
+        check_positions(positions)
         if len(positions) != views:
             wanted = f"{views} (row, col) (in commands: optics.positions)"
             raise ValueError(f"positions must be {wanted}, got {positions}")
@@ -324,6 +330,7 @@ class SetNet(EventToVideoNetwork):
         )
         if state is None:
             return zeros
+        check_state_alone(state)
         found, sizes = _sizes(state), _sizes(zeros)
         if found != sizes:
             raise ValueError(f"state must have sizes {sizes} for these voxels, got {found}")

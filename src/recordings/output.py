@@ -25,6 +25,8 @@ from PIL import GifImagePlugin, Image
 from src.recordings.files.event_file import HeightWidth
 from src.recordings.reconstruction import Frame
 from src.records.atomic import check_free_space, name_path_in_errors, partial_path
+from src.sim.checks import check_in_range
+from src.sim.user_values import read_array, read_path
 
 VP9 = {"crf": "12", "b": "0", "deadline": "realtime", "cpu-used": "6"}  # error of 1 level, rms
 KEY_FRAME_EVERY = 12
@@ -93,15 +95,14 @@ def write_video(path: Path | str, frames: Iterable[np.ndarray], fps: float) -> i
     return how many.
 
     The file is there when it is whole.  Raises ValueError for another ending of `path`, no frames,
-    frames of several sizes, floats outside [-0.5, 1.5] (what is beyond [0, 1] is clipped), other
-    types and an `fps` outside [0.1, 1000].
+    frames of several sizes or with a mask, floats outside [-0.5, 1.5] (what is beyond [0, 1] is
+    clipped), other types and an `fps` outside [0.1, 1000].
     """
-    path, given = Path(path), map(np.asarray, frames)
+    path, given = read_path("path", path), (read_array("frames", frame) for frame in frames)
     first = next(given, None)
     if path.suffix != ".mp4":
         raise ValueError(f"path must end in .mp4, got {path}")
-    if not 0.1 <= fps <= 1000:
-        raise ValueError(f"fps must be in [0.1, 1000], got {fps}")
+    check_in_range("fps", fps, 0.1, 1000)
     if first is None or first.ndim not in (2, 3) or first.shape[2:] not in ((), (3,)):
         shape = "none" if first is None else first.shape
         raise ValueError(f"frames must be of shape (h, w) or (h, w, 3), got {shape}")
@@ -127,7 +128,7 @@ def _check_values(frame: np.ndarray) -> None:
     is_code = frame.dtype.kind == "f" and np.isfinite([low, high]).all()
     if frame.dtype != np.uint8 and not (is_code and low >= -0.5 and high <= 1.5):
         got = f"{frame.dtype} from {low} to {high}"
-        raise ValueError(f"frames must be uint8 or floats in [0, 1], got {got}")
+        raise ValueError(f"frames must be uint8 or floats in [-0.5, 1.5], got {got}")
 
 
 def round_to_uint8(picture: np.ndarray) -> UInt8[np.ndarray, "*shape"]:

@@ -70,15 +70,19 @@ def accepts_views(network: EventToVideoNetwork, positions: Sequence[Position]) -
     return wants in (None, 1) or (wants == len(positions) and is_arranged_as_layout(positions))
 
 
-def takes_all_views(network: EventToVideoNetwork, positions: Sequence[Position]) -> bool:
+def takes_all_views(
+    network: EventToVideoNetwork, positions: Sequence[Position], views_file: str | None = None
+) -> bool:
     """Return whether `network` takes all views, at `positions`; False: the centre view alone.
 
-    Raises ValueError where it wants another number of views, or others than are there.
+    Raises ValueError where it wants another number of views, or others than are there; it names
+    the `views_file` that they are from, or says that one is missing.
     """
     wants, views = network.views, len(positions)
     if wants not in (None, 1, views):
-        how = "; give views=views.yaml" if views == 1 else ""
-        raise ValueError(f"ckpt wants {wants} views, the recording has {views}{how}")
+        where = "the recording" if views_file is None else f"views={views_file}"
+        how = "; give views=views.yaml" if views_file is None and views == 1 else ""
+        raise ValueError(f"ckpt wants {wants} views, {where} has {views}{how}")
     if not accepts_views(network, positions):
         arranged = f"arranged as {list(layout(views))}"
         raise ValueError(f"ckpt wants views {arranged}, the recording has {list(positions)}")

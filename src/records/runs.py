@@ -13,6 +13,7 @@ import yaml
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
+from src import COMMAND
 from src.metrics.table import NAMES
 from src.records import results, safe_yaml
 
@@ -210,7 +211,7 @@ def _plan(hydra: dict) -> SweepPlan:
     entry_point, config = hydra["job"]["name"], hydra["job"]["config_name"]
     sweep = "" if entry_point == config else config
     how = f"--config-dir {_find_config_dir(hydra)} --config-name {sweep}" if sweep else "-m"
-    start = f"python -m src.{entry_point} {how}"
+    start = f"{COMMAND}{entry_point} {how}"
     jobs = BasicSweeper.split_arguments(parsed, None)[0]
     return SweepPlan(sweep, " ".join([start, *asked]), jobs)
 

@@ -13,7 +13,8 @@ def check_in_range(key: str, value: Any, low: float, high: float) -> None:
     is_number = isinstance(value, Real)
     if not (is_number and low <= value <= high):
         bounds = f">= {low:.5g}" if high == math.inf else f"in [{low:.5g}, {high:.5g}]"
-        raise ValueError(f"{key} must be {bounds}, got {value}")
+        got = repr(value) if isinstance(value, str) else value
+        raise ValueError(f"{key} must be {bounds}, got {got}")
 
 
 def is_range(ends: Any) -> bool:

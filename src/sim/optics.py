@@ -62,6 +62,16 @@ def most_central_view_index(positions: Sequence[Position]) -> int:
     return min(range(len(positions)), key=lambda i: sum(axis**2 for axis in positions[i]))
 
 
+def check_positions(positions: Any) -> None:
+    """Raise ValueError unless `positions` are pairs (row, col) of numbers."""
+    try:
+        fits = all(not isinstance(pair, str) and len([*map(int, pair)]) == 2 for pair in positions)
+    except (TypeError, ValueError, OverflowError):
+        fits = False
+    if not fits:
+        raise ValueError(f"positions must be the (row, col) of each view, got {positions}")
+
+
 def _is_position(value: Any) -> bool:
     is_pair = hasattr(value, "__len__") and len(value) == 2
     return is_pair and all(isinstance(axis, Integral) for axis in value)

@@ -16,6 +16,8 @@ from numba import njit
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from src.sim.user_values import describe_coarse_times, is_number, read_array
+
 f32 = np.float32
 
 
@@ -24,23 +26,27 @@ def voxel_grid(
     height: int, width: int,
 ) -> Float[Tensor, "bins h w"]:  # fmt: skip
     """Return the grid, float32, of the events with t0 <= t <= t1; zeros without any.  Warns where
-    events are given and none lies in the window.
+    events are given and none lies in the window, or the type of `t` hardly resolves it.
 
     `t`, in the unit of `t0` and `t1` and in any order; `x`, `y` in pixels; `p` in {-1, 1} or
-    {0, 1}: arrays or tensors of one length.  Each event's weights are multiples of 2**-20, so
-    that sums of up to 16 events a cell are exact and do not depend on their order.  Raises
-    ValueError for coordinates outside or no whole numbers, lengths that differ, t1 <= t0, edges
-    that are not finite, times that are no finite numbers or another polarity.
+    {0, 1}, in each call by itself: without any -1 in it 0 is OFF, beside -1 it is refused.  All are
+    arrays or tensors of one length.  Each event's weights are multiples of 2**-20, so that sums of
+    up to 16 events a cell are exact and do not depend on their order.  Raises ValueError for
+    coordinates outside or no whole numbers, lengths that differ, t1 <= t0, edges that are no finite
+    numbers, times that are no finite numbers, another polarity, masked arrays, and tensors that
+    NumPy does not read.
     """
-    t, x, y, p = map(_as_native_array, (t, x, y, p))
+    given = {"t": t, "x": x, "y": y, "p": p}
+    t, x, y, p = (_as_native_array(name, values) for name, values in given.items())
     if not t.shape == x.shape == y.shape == p.shape or t.ndim != 1:
         shapes = [part.shape for part in (t, x, y, p)]
         raise ValueError(f"t, x, y, p must be of one length, got shapes {shapes}")
     sizes = bins, height, width
     if not all(isinstance(size, Integral) and size >= 1 for size in sizes):
         raise ValueError(f"bins, height, width must be whole numbers >= 1, got {sizes}")
-    if not (t1 > t0 and np.isfinite(t0) and np.isfinite(t1)):
-        raise ValueError(f"voxel_grid needs finite t0 < t1, got t0={t0}, t1={t1}")
+    are_numbers = is_number(t0) and is_number(t1)
+    if not (are_numbers and t1 > t0 and np.isfinite(t0) and np.isfinite(t1)):
+        raise ValueError(f"voxel_grid needs finite t0 < t1, got t0={t0!r}, t1={t1!r}")
     grid, t0, t1 = torch.zeros(sizes, dtype=torch.float32), float(t0), float(t1)
     if t.size == 0:
         return grid
@@ -55,6 +61,8 @@ def voxel_grid(
         warnings.warn(
             f"no event lies in the window: t is {reach}; is its unit the same?", stacklevel=2
         )
+    elif said := describe_coarse_times(t, t1 - t0):
+        warnings.warn(said, stacklevel=2)
     times = t.astype(np.int64) if t.dtype.kind in "iu" else t.astype(np.float64)
     p = p.astype(np.float32) if p.dtype == np.float16 else p
     scale = np.float32(np.float32(bins - 1) / np.float32(t1 - t0))
@@ -69,8 +77,8 @@ def voxel_grid(
     return grid
 
 
-def _as_native_array(part: ArrayLike) -> np.ndarray:
-    array = np.asarray(part)
+def _as_native_array(name: str, values: ArrayLike) -> np.ndarray:
+    array = read_array(name, values)
     return array if array.dtype.isnative else array.astype(array.dtype.newbyteorder("="))
 
 

@@ -14,7 +14,7 @@ import torch
 from lightning import Trainer
 from rich.console import Console
 
-from src.app import entry_point, methods
+from src.app import entry_point, help, methods
 from src.app.help import help_text
 from src.records.results import ScoreRow, build_rich_score_table, describe_score_difference
 from src.training.progress import TrainingProgress
@@ -40,6 +40,20 @@ def test_help_shows_keys_with_their_comments_and_the_choices_of_groups():
     assert re.search(
         r"^  turbulence=mixed +or extreme, measured, medium, none, recorded, strong", groups, re.M
     )
+
+
+def test_help_shows_no_group_of_one_choice_but_its_keys():
+    text = help_text("reconstruct", "")
+    assert "reading=" not in text and re.search(r"^time_unit: auto +# auto, s, ms", text, re.M)
+    text = help_text("train", "")
+    assert "callbacks=" not in text and text.count("fine_tuning") == 1
+    assert "target.rows" in help_text("calibrate", "")
+
+
+def test_help_of_the_installed_package_has_its_command(monkeypatch):
+    monkeypatch.setattr(help, "COMMAND", "lightfield-events ")
+    text = help_text("reconstruct", "To video: python -m src.reconstruct recording=cap.raw\n")
+    assert text.startswith("To video: lightfield-events reconstruct recording=cap.raw\n")
 
 
 @pytest.mark.parametrize("command", ["simulate", "train"])

@@ -172,6 +172,18 @@ def test_times_too_coarse_for_the_window_are_told_of():
         runtime(network("e2vid")).step(**events(0) | late)
 
 
+@pytest.mark.parametrize(
+    ("t", "words"),
+    [
+        (torch.zeros(400, requires_grad=True), "^t must be an array .* requires grad"),
+        (np.ma.masked_array(np.zeros(400), True), "^t must be without a mask, got a masked array"),
+    ],
+)
+def test_arrays_that_cannot_be_read_are_named(t, words):
+    with pytest.raises(ValueError, match=words):
+        runtime(network("e2vid")).step(**events(0) | {"t": t})
+
+
 def test_off_events_of_weight_0_are_told_of_once():
     window, live = events(0), runtime(network("e2vid"))
     on = (window["p"] > 0).astype(np.float64)
@@ -330,6 +342,7 @@ def test_another_network_is_refused():
     ("options", "words"),
     [
         ({"positions": [0, 0]}, r"positions must be the \(row, col\) of each view, got \[0, 0\]"),
+        ({"positions": ["ab"] * 9}, r"positions must be the \(row, col\) of each view, got \['ab'"),
         ({"positions": 9}, r"positions must be the \(row, col\) of each view, got 9"),
         ({"height": 64.5}, "height and width must be >= 8 px, whole .*, got 64.5 and 32"),
         ({"threads": "2"}, r"threads must be in 1\.\.1024, got 2"),

@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from jaxtyping import config
 from torch.nn.utils import parametrize
 
 from src.deploy.cost import macs_per_frame
@@ -165,6 +166,27 @@ def test_another_shape_is_refused_in_one_line():
         forward(small(), torch.zeros(1, 2, 3, 16))
 
 
+def test_positions_that_are_none_are_refused(monkeypatch):
+    monkeypatch.setattr(config, "jaxtyping_disable", True)
+    with pytest.raises(
+        ValueError, match=r"^positions must be the \(row, col\) of each view, got 9"
+    ):
+        small()(voxels()[:, 0], None, positions=9)
+
+
+@pytest.mark.parametrize("size", [(1, 16), (16, 3), (0, 16)])
+def test_a_side_that_cannot_be_padded_is_refused(size):
+    with pytest.raises(ValueError, match=r"^voxels must be 4 px or more in height and width, got"):
+        small()(torch.zeros(1, 2, 3, *size), None)
+    assert small()(torch.zeros(1, 2, 3, 4, 5), None)[0].shape == (1, 1, 4, 5)
+
+
+@pytest.mark.parametrize("window_s", [8333, torch.tensor([8333.0])])
+def test_a_window_in_microseconds_is_told_of(window_s):
+    with pytest.warns(UserWarning, match="^a window lasts 8333 s: is window_s in seconds"):
+        small()(voxels()[:, 0], window_s=window_s)
+
+
 def test_an_array_is_refused_in_one_line():
     check = inspect.unwrap(check_voxel_shape)  # without the type checks of tests
     with pytest.raises(ValueError, match=r"^voxels must be a tensor, got ndarray$"):
@@ -177,6 +199,8 @@ def test_a_state_of_another_size_is_refused(recurrent, shape):
     network = small(recurrent=recurrent)
     _, state = network(voxels()[:, 0], None)
     network(voxels()[:, 1], state)
+    with pytest.raises(ValueError, match="^state must be the second of the two that a network re"):
+        network(voxels()[:, 1], network(voxels()[:, 0], None))
     for call in (network, network.warm_up):
         for wrong in (state, 5):
             with pytest.raises(ValueError, match=r"^state must have sizes \[\(., 8, .*, got"):

@@ -4,6 +4,7 @@ import inspect
 import math
 from itertools import pairwise
 
+import jaxtyping
 import pytest
 import torch
 from omegaconf import OmegaConf
@@ -449,6 +450,7 @@ def test_the_file_gives_the_network_back(tmp_path):
         ((1, 7, 3, 16, 16), {}, "views must be 1, 2"),
         ((1, 9, 3, 16, 16), {"positions": [(0, 0)]}, "positions must be 9"),
         ((0, 9, 3, 16, 16), {}, "voxels must hold one clip and one window or more"),
+        ((1, 9, 3, 3, 16), {}, "voxels must be 4 px or more in height and width, got"),
         ((1, 9, 3, 16, 16), {"window_s": 0.0}, "window_s must be > 0"),
         ((2, 9, 3, 16, 16), {"window_s": torch.tensor([0.1, 0.0])}, "window_s must be > 0"),
         ((1, 9, 3, 16, 16), {"window_s": torch.tensor([math.nan])}, "window_s must be > 0"),
@@ -475,14 +477,17 @@ def test_another_shape_is_refused_in_one_line():
         forward(small(), torch.zeros(1, 1, 5, 48))
 
 
-def test_a_state_of_another_size_is_refused():
+def test_a_state_of_another_size_is_refused(monkeypatch):
     network = small()
     _, state = network(voxels()[:, 0], None)
     with pytest.raises(ValueError, match="state must have sizes"):
         network(voxels(side=24)[:, 0], state)
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+    with pytest.raises(ValueError, match="^state must be the second of the two that a network re"):
+        network(voxels()[:, 0], network(voxels()[:, 0], None))
 
 
-@pytest.mark.parametrize("wrong", [[(0, 0), (0, 0)], [(0, 0), (0, 0.5)], [(0, 0), (0, 99)]])
+@pytest.mark.parametrize("wrong", [[(0, 0), (0, 0)], [(0, 0), (0, 0.5)], [(0, 0), (0, 99)], 9])
 def test_positions_that_are_none_are_refused(wrong):
     check = inspect.unwrap(SetNet.checked_positions)  # without the type checks of tests
     with pytest.raises(ValueError, match="positions"):

@@ -327,6 +327,8 @@ def test_nine_view_weights_with_one_view_are_refused():
         reconstruction.takes_all_views(network, layout(1))
     with pytest.raises(ValueError, match="wants 9 views, the recording has 25$"):
         reconstruction.takes_all_views(network, layout(25))  # views= was given
+    with pytest.raises(ValueError, match="wants 9 views, views=one.yaml has 1$"):
+        reconstruction.takes_all_views(network, layout(1), "one.yaml")
 
 
 def test_nine_view_weights_take_a_square_alone():

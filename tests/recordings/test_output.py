@@ -1,6 +1,7 @@
 """Every format gives back the frames and their times, also of a run that was stopped."""
 
 import csv
+import inspect
 
 import cv2
 import h5py
@@ -152,9 +153,21 @@ def test_no_video_of_wrong_frames(name, shapes, fps, message, tmp_path):
     "frame", [np.full(SIZE, 60, np.int64), np.full(SIZE, 60.0), np.full(SIZE, np.nan)]
 )
 def test_values_that_are_no_code_values_are_refused(frame, tmp_path):
-    with pytest.raises(ValueError, match="frames must be uint8 or floats in"):
+    with pytest.raises(ValueError, match=r"frames must be uint8 or floats in \[-0.5, 1.5\], got"):
         write_video(tmp_path / "a.mp4", [frame], 30)
     assert not (tmp_path / "a.mp4").exists()
+
+
+def test_what_no_video_can_be_written_of_is_named(tmp_path):
+    write, frame = inspect.unwrap(write_video), np.zeros(SIZE)  # without the type checks of tests
+    masked = np.ma.masked_array(frame, True)
+    for given, message in (
+        ((None, [frame], 30), "path must be a path, got a NoneType"),
+        ((tmp_path / "a.mp4", [frame], "30"), r"fps must be in \[0.1, 1000\], got '30'"),
+        ((tmp_path / "a.mp4", [masked], 30), "frames must be without a mask, got a masked array"),
+    ):
+        with pytest.raises(ValueError, match=f"^{message}"):
+            write(*given)
 
 
 def test_a_folder_of_other_frames_is_not_deleted(tmp_path):

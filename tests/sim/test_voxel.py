@@ -179,6 +179,30 @@ def test_events_that_all_lie_outside_are_told_of():
     assert not grid.any()
 
 
+def test_times_too_coarse_for_the_window_are_told_of():
+    t = (1.6e9 + np.linspace(0, 1 / 120, 4)).astype(np.float32)
+    where = {"x": [1] * 4, "y": [1] * 4, "p": [1] * 4, "t0": 1.6e9, "t1": 1.6e9 + 1 / 120}
+    with pytest.warns(UserWarning, match="^t is float32, in steps of 128 at 1.6e.09: float64"):
+        voxel_grid(t, **where, **SIZE)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"t0": None}, "finite t0 < t1, got t0=None, t1=10"),
+        ({"t0": "0"}, "finite t0 < t1, got t0='0', t1=10"),
+        ({"t1": np.array([10.0])}, r"finite t0 < t1, got t0=0, t1=array\(\[10"),
+        ({"t": torch.tensor([5.0], requires_grad=True)}, "^t must be an array .* requires grad"),
+        ({"t": torch.tensor([5.0]).bfloat16()}, "^t must be an array that NumPy reads: .*BFloat16"),
+        ({"p": np.ma.masked_array([1], [True])}, "^p must be without a mask, got a masked array"),
+    ],
+)
+def test_what_no_grid_can_be_made_of_is_named(change, words):
+    make = inspect.unwrap(voxel_grid)  # without the type checks of tests
+    with pytest.raises(ValueError, match=words):
+        make(**dict(t=[5], x=[1], y=[1], p=[1], t0=0, t1=10, **SIZE) | change)
+
+
 def test_the_order_of_bytes_does_not_matter():
     given = {"t": [1, 5, 9], "x": [1, 2, 3], "y": [0, 1, 2], "p": [1, -1, 1]}
     swapped = {name: np.array(part, ">i4") for name, part in given.items()}

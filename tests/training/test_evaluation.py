@@ -12,6 +12,7 @@ from torch.utils.data import DataLoader
 
 from baselines.firenet import FireNet
 from baselines.postprocess import Postprocessed
+from src.deploy.cost import Timing
 from src.metrics.video_metrics import VideoMetrics
 from src.models.backward_warmup import BackwardWarmup
 from src.models.network import EventToVideoNetwork, FramePostprocessor
@@ -119,3 +120,10 @@ def test_cost_is_measured_on_the_device_of_the_clips(wrap):
         layer.register_forward_pre_hook(lambda self, given: seen.append(self.weight.device))
     macs, milliseconds = evaluation.measure_macs_and_ms(method, there)
     assert macs > 0 and milliseconds > 0 and set(seen) == {torch.device("meta")}
+
+
+def test_time_is_the_least_of_several_windows(monkeypatch):
+    busy = Timing(median_ms=527.0, least_ms=7.6, frames=5, clock="wall")
+    monkeypatch.setattr(evaluation, "time_frame", lambda *_, **__: busy)
+    window = torch.zeros(1, 1, 5, 16, 16)
+    assert evaluation.measure_frame_macs_and_ms(FireNet(), window)[1] == 7.6

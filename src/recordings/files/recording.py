@@ -52,6 +52,7 @@ from src.recordings.files.survey import TimeSurvey, survey_times
 from src.recordings.files.text_file import TextFile
 from src.recordings.files.text_layout import TEXT_ENDINGS
 from src.recordings.files.time_unit import check_times, to_us
+from src.sim.user_values import read_path
 
 Reader = Callable[[Path, ReadOptions], EventFile]
 FileState = tuple[str, int, int]
@@ -113,7 +114,7 @@ def open_recording(
     """
     if not isinstance(options, ReadOptions):
         raise ValueError(f"options must be ReadOptions(...), got {options}")
-    path = Path(path)
+    path = read_path("recording", path)
     if find_folder_reader(path) is None and (not path.is_file() or path.stat().st_size == 0):
         raise ValueError(f"recording must be an event file, got {path}: {_why_not_a_file(path)}")
     kept, survey, swapped = _open_and_survey(path, find_file_states(path), options)

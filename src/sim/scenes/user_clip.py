@@ -32,6 +32,7 @@ from src.sim.scenes.moving_layers import (
     render_frame,
 )
 from src.sim.scenes.video_files import VideoSource, find_videos, read_picture
+from src.sim.user_values import read_array
 
 LARGEST_SIDE_PX = 512  # of the frames, where nothing else is asked for
 LEAST_SIDE_PX = 16
@@ -166,10 +167,10 @@ def clip_from_array(
     uint8 or of floats in [0, 1].  `start_s`, `end_s` and `white_level` as in `read_video`,
     `seconds`, `speed_widths_per_s` and `seed` as in `read_photograph`.
 
-    Raises ValueError for another shape, for values outside, for a video without `fps` and for what
+    Raises ValueError for another shape, a mask, values outside, a video without `fps` and for what
     is of the other kind.
     """
-    array = np.asarray(values)
+    array = read_array("photo_or_video", values)
     is_colour = array.ndim == 3 and array.shape[2] <= 4
     if array.ndim not in (2, 3) or is_colour or (array.ndim == 3 and len(array) < 2):
         wanted = "(h, w), a photograph, or (frames, h, w), two frames or more, grey"

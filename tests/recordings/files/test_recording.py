@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from jaxtyping import config
 
 from src.recordings.files.event_file import EVENT
 from src.recordings.files.recording import iter_events, open_recording, read_events
@@ -144,6 +145,13 @@ def test_a_file_that_is_none_is_named(tmp_path, ending, content):
     path = tmp_path / f"a{ending}"
     path.write_bytes(content)
     with pytest.raises(ValueError, match=f"a{ending}"):
+        read_events(path)
+
+
+@pytest.mark.parametrize("path", [None, np.zeros(3)])
+def test_what_is_no_path_is_named(path, monkeypatch):
+    monkeypatch.setattr(config, "jaxtyping_disable", True)
+    with pytest.raises(ValueError, match="^recording must be a path, got a (NoneType|ndarray)"):
         read_events(path)
 
 
