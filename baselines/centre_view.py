@@ -6,8 +6,13 @@ from typing import Any
 from jaxtyping import Float
 from torch import Tensor
 
-from src.models.layers import check_state_sizes, pad_centred_to_multiple
-from src.models.network import WINDOW_S, EventToVideoNetwork, check_voxel_shape
+from src.models.layers import pad_centred_to_multiple
+from src.models.network import (
+    WINDOW_S,
+    EventToVideoNetwork,
+    check_state_sizes,
+    check_voxel_shape,
+)
 from src.sim.optics import Position, check_positions, layout, most_central_view_index
 from src.sim.voxel import normalise_nonzero
 
@@ -17,10 +22,7 @@ def find_centre_view(views: int, positions: Sequence[Position] | None) -> int:
     `layout`.  Raises ValueError for positions of another number.
     """
     positions = layout(views) if positions is None else positions
-    check_positions(positions)
-    if len(positions) != views:
-        wanted = f"{views} (row, col) for these voxels"
-        raise ValueError(f"positions must be {wanted}, got {len(positions)}: {list(positions)}")
+    check_positions(positions, views)
     return most_central_view_index(positions)
 
 

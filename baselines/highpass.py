@@ -8,8 +8,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from baselines.centre_view import find_centre_view
-from src.models.layers import check_state_sizes
-from src.models.network import WINDOW_S, EventToVideoNetwork, check_voxel_shape
+from src.models.network import (
+    WINDOW_S,
+    EventToVideoNetwork,
+    check_state_sizes,
+    check_voxel_shape,
+)
 from src.sim.optics import Position
 
 

@@ -86,8 +86,7 @@ def load_postprocessor(weights: str, allowed_packages: Sequence[str] = ()) -> Fr
     except ValueError as error:
         raise ValueError(
             "postprocess.postprocessor must be a name in weights/ or a path, got "
-            f"{weights} ({error}); make one with `{COMMAND}train experiment=mambatm` and "
-            "scripts.ship_weights"
+            f"{weights} ({error}); make one with `{COMMAND}train experiment=mambatm`"
         ) from error
     if not isinstance(network, FramePostprocessor):
         kind = type(network).__name__

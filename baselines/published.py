@@ -168,7 +168,7 @@ def load_pretrained(architecture: str, weights: str | None) -> nn.Module:
     if path.is_file():
         return load_published(architecture, path)
     command = f"`{COMMAND}train experiment=clean/{architecture}`"
-    make = f"make ours with {command} and ship_weights, " if path.parent.name == "clean" else ""
+    make = f"make ours with {command}, " if path.parent.name == "clean" else ""
     raise ValueError(
         f"baseline.weights must be a file with the weights of {architecture}, got {weights}; {make}"
         "or give the path of its authors' checkpoint"

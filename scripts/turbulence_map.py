@@ -69,9 +69,8 @@ def compute_differences(
             continue
         pooled = pool_same_clips("folders", [by_name[ours]], [by_name[theirs]])
         if compared := compare_clips(*pooled, metric):
-            left, right, (low, high) = compared
-            star = "*" if low * high > 0 else ""
-            cells[setting] = (left - right, f"{left - right:+z.{digits}f}{star}")
+            change, (low, high) = compared.ours - compared.theirs, compared.interval
+            cells[setting] = (change, f"{change:+z.{digits}f}" + ("*" if low * high > 0 else ""))
     return cells
 
 

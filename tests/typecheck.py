@@ -1,5 +1,5 @@
-"""The run-time checks of annotations in tests: beartype's, with an int accepted as a float, and
-around them jaxtyping's where there are shapes of arrays, which cost several times as much.
+"""The run-time checks of annotations in tests: beartype's, with an int accepted as a float, in
+a context of jaxtyping's for each call where there are shapes of arrays.
 """
 
 import inspect

@@ -21,8 +21,8 @@ UNIT_NORM_TOLERANCE = 0.05  # of gates trained with spectral norm, whose estimat
 
 def set_model_from_start_weights(cfg: DictConfig) -> Path | None:
     """Return the file that `start` names, None for a training from nothing, and make `cfg.model`
-    its network: width, stem and all that follows from the weights; `model.spectral_norm` stays, of
-    weights that have it or where it is typed, as files hold it folded.
+    its network: width, stem and all that follows from the weights.  `model.spectral_norm`, which
+    files hold folded, stays where the gates have norm one, and where it is typed.
 
     Where `ckpt` goes on, the `start` of budget=fine_tuning gives way to what `ckpt` began from; one
     that is typed stays.  An E2VID on one view is given those of `optics`.  Raises ValueError for a
@@ -85,11 +85,23 @@ def _refuse_other_typed_values(cfg: DictConfig, kwargs: dict[str, Any]) -> None:
         key = _find_typed_key(cfg, name)
         if key is None or name == "_target_":
             continue
-        if name in kwargs and value != kwargs[name]:
-            raise ValueError(f"{key} must be {kwargs[name]}, as in start={cfg.start}, got {value}")
-        if name not in kwargs and _network_arguments(cfg) != kwargs:
-            wanted = f"{key} must be that of start={cfg.start}"
-            raise ValueError(f"{wanted}, got {name} = {value}")
+        if name not in kwargs:
+            _refuse_other_preset(cfg, key, kwargs)
+        elif value != kwargs[name]:
+            wanted = f"{_as_typed(kwargs[name])}, as in start={cfg.start}"
+            raise ValueError(f"{key} must be {wanted}, got {_as_typed(value)}")
+
+
+def _refuse_other_preset(cfg: DictConfig, key: str, kwargs: dict[str, Any]) -> None:
+    """Raise ValueError for a preset, set by `key`, whose network is not that of `kwargs`."""
+    built = _network_arguments(cfg)
+    other = [name for name in kwargs if built.get(name) != kwargs[name]]
+    if other:
+        wanted, got = (
+            ", ".join(f"{name}={_as_typed(values.get(name))}" for name in other)
+            for values in (kwargs, built)
+        )
+        raise ValueError(f"{key} must have {wanted}, as in start={cfg.start}, got {got}")
 
 
 def _find_typed_key(cfg: DictConfig, name: str) -> str | None:
@@ -100,6 +112,12 @@ def _find_typed_key(cfg: DictConfig, name: str) -> str | None:
     keys = [f"model.{name}", str(written[name]).removeprefix("${").removesuffix("}")]
     keys += ["model"] if cfg.model._target_.endswith(".preset") else []
     return next((key for key in keys if entry_point.is_set_on_command_line(key)), None)
+
+
+def _as_typed(value: Any) -> str:
+    return (
+        "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
+    )
 
 
 def _network_arguments(cfg: DictConfig) -> dict[str, Any]:

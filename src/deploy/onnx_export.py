@@ -24,7 +24,7 @@ from torch.utils import _pytree as pytree
 from src.deploy.explicit_state import ExplicitStateNetwork
 from src.deploy.picture_size import check_picture_size
 from src.models.folding import inference_copy
-from src.models.network import WINDOW_S, EventToVideoNetwork
+from src.models.network import WINDOW_S, EventToVideoNetwork, check_state_sizes
 from src.records.atomic import atomic_path
 from src.sim.optics import Position
 
@@ -75,7 +75,8 @@ def _open_written(path: Path, kind: str) -> "OnnxNetwork":
     try:
         return OnnxNetwork(path)
     except Exception as error:  # ONNX Runtime raises all kinds
-        raise ValueError(f"{kind} has a part that ONNX Runtime cannot run") from error
+        why = " ".join(str(error).split())
+        raise ValueError(f"{kind} has a part that ONNX Runtime cannot run: {why}") from error
 
 
 def require_onnx() -> None:
@@ -120,6 +121,7 @@ class OnnxNetwork(EventToVideoNetwork):
         names = [name for name in self.inputs if name.startswith("state")]
         if state is None:
             state = [torch.zeros(self.inputs[name]).numpy() for name in names]
+        check_state_sizes(state, [tuple(self.inputs[name]) for name in names])
         fed = {"voxels": voxels.numpy(), **dict(zip(names, state, strict=True))}
         if "window_s" in self.inputs:
             fed["window_s"] = torch.as_tensor(window_s, dtype=torch.float32).reshape(1).numpy()

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from src import COMMAND
 from src.deploy.runtime import EventListRuntime, fastest_form, supports_event_lists
 from src.live_view.live_windows import EventWindow
 from src.models.network import EventToVideoNetwork
@@ -56,7 +57,9 @@ class NetworkRunner:
         self.name, self.views, fps = name, views, settings.fps
         length = settings.window_length or ("frame" if network.uses_window_length else "trained")
         if length == "growing":  # at rates that no machine reaches live
-            raise ValueError("window_length must be frame or trained for src.live, got growing")
+            raise ValueError(
+                f"window_length must be frame or trained for `{COMMAND}live`, got growing"
+            )
         self.frames_per_window = build_window_rule(length, fps=fps).frames_per_window
         form = settings.form or (fastest_form() if supports_event_lists(network) else "float32")
         self.network = build_runnable_network(network, form, "cpu", views, settings.bins)

@@ -21,13 +21,12 @@ from src.models.layers import (
     ConvGRU,
     ConvLSTM,
     ResidualBlock,
-    check_state_sizes,
     pad_centred_to_multiple,
 )
 from src.models.network import (
     WINDOW_S,
     EventToVideoNetwork,
-    check_state_alone,
+    check_state_sizes,
     check_voxel_shape,
     check_window_length,
 )
@@ -137,10 +136,7 @@ class E2VID(EventToVideoNetwork):
             raise ValueError(f"positions must be {wanted}, got {list(positions)}")
 
     def _check_number(self, positions: Sequence[Position]) -> None:
-        check_positions(positions)
-        if len(positions) != self.views:
-            wanted = f"{self.views} (row, col) for this network"
-            raise ValueError(f"positions must be {wanted}, got {len(positions)}: {list(positions)}")
+        check_positions(positions, self.views)
 
     def _check_order(self, positions: Sequence[Position]) -> None:
         """Raise ValueError for another number of views, and for those of `layout` in another order:
@@ -174,7 +170,6 @@ class E2VID(EventToVideoNetwork):
         """Raise ValueError unless `state` has the sizes that padded voxels `x` leave."""
         if not state:
             return
-        check_state_alone(state)
         check_state_sizes(state, self.state_sizes(x))
 
     def state_sizes(self, x: Float[Tensor, "n c h w"]) -> list[tuple[int, ...]]:

@@ -1,20 +1,12 @@
 """Layers that recurrent reconstruction networks are made of; state in, state out."""
 
-from collections.abc import Callable, Sequence
-from typing import Any, Literal
+from collections.abc import Callable
+from typing import Literal
 
 import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor, nn
 from torch.nn import functional
-from torch.utils import _pytree as pytree
-
-
-def check_state_sizes(state: Any, sizes: Sequence[tuple[int, ...]]) -> None:
-    """Raise ValueError unless the tensors of `state`, in order, have these `sizes`."""
-    found = [tuple(getattr(leaf, "shape", ())) for leaf in pytree.tree_leaves(state)]
-    if found != list(sizes):
-        raise ValueError(f"state must have sizes {list(sizes)} for these voxels, got {found}")
 
 
 def pad_centred_to_multiple(

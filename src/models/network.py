@@ -3,11 +3,13 @@
 import math
 import warnings
 from collections.abc import Sequence
+from numbers import Real
 from typing import TYPE_CHECKING, Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.utils import _pytree as pytree
 
 from src.sim.optics import Position
 
@@ -16,7 +18,7 @@ if TYPE_CHECKING:  # a network knows nothing of the simulation; a sample is read
 
 WINDOW_S = 1 / 120  # default length of a window, that of training
 LONGEST_WINDOW_S = 10.0  # beyond, times are hardly in seconds
-LEAST_SIDE_PX = 4  # of voxels: sides are padded to a multiple of 8 by reflection
+LEAST_SIDE_PX = 4  # of voxels: what reflection pads to a multiple of 8
 MAX_WINDOWS = 40  # that a network is given at once; more take more memory and no less time
 
 
@@ -121,6 +123,15 @@ def check_state_alone(state: Any) -> None:
         raise ValueError("state must be the second of the two that a network returns, got both")
 
 
+def check_state_sizes(state: Any, sizes: Sequence[tuple[int, ...]]) -> None:
+    """Raise ValueError unless the tensors of `state`, in order, have these `sizes`, and for the
+    pair (frame, state)."""
+    check_state_alone(state)
+    found = [tuple(getattr(leaf, "shape", ())) for leaf in pytree.tree_leaves(state)]
+    if found != list(sizes):
+        raise ValueError(f"state must have sizes {list(sizes)} for these voxels, got {found}")
+
+
 def check_window_length(window_s: float | Tensor) -> None:
     """Raise ValueError unless `window_s` is finite and > 0 seconds, and warn of one that is longer
     than LONGEST_WINDOW_S; a tensor on a GPU, which would be synchronised, and what is traced are
@@ -129,11 +140,13 @@ def check_window_length(window_s: float | Tensor) -> None:
     if torch.compiler.is_compiling():
         return
     if isinstance(window_s, Tensor):
-        if window_s.device.type != "cpu" or torch.jit.is_tracing():
+        if window_s.device.type != "cpu" or torch.jit.is_tracing() or not window_s.numel():
             return
         least, longest = window_s.min().item(), window_s.max().item()
+    elif isinstance(window_s, Real):
+        least = longest = float(window_s)
     else:
-        least = longest = window_s
+        raise ValueError(f"window_s must be > 0 seconds, got {window_s!r}")
     if not 0 < least <= longest < math.inf:
         got = window_s.tolist() if isinstance(window_s, Tensor) else window_s
         raise ValueError(f"window_s must be > 0 seconds, got {got}")

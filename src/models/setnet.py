@@ -299,10 +299,7 @@ class SetNet(EventToVideoNetwork):
             allowed = f"in 1..{MAX_VIEWS} (in commands: optics.views)"
             raise ValueError(f"views must be {allowed}, got {views}")
         positions = layout(views) if positions is None else positions
-        check_positions(positions)
-        if len(positions) != views:
-            wanted = f"{views} (row, col) (in commands: optics.positions)"
-            raise ValueError(f"positions must be {wanted}, got {positions}")
+        check_positions(positions, views)
         whole = tuple((int(row), int(column)) for row, column in positions)
         is_near = all(max(abs(row), abs(column)) <= REACH for row, column in whole)
         if not is_near or len(set(whole)) < views or whole != tuple(map(tuple, positions)):

@@ -102,6 +102,8 @@ def write_video(path: Path | str, frames: Iterable[np.ndarray], fps: float) -> i
     first = next(given, None)
     if path.suffix != ".mp4":
         raise ValueError(f"path must end in .mp4, got {path}")
+    if isinstance(fps, str):
+        raise ValueError(f"fps must be a number, got {fps!r}")
     check_in_range("fps", fps, 0.1, 1000)
     if first is None or first.ndim not in (2, 3) or first.shape[2:] not in ((), (3,)):
         shape = "none" if first is None else first.shape

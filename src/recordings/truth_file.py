@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from src import COMMAND
 from src.recordings.files.event_file import HeightWidth
 from src.recordings.output import resize_picture, round_to_uint8
 from src.recordings.views import Views
@@ -93,4 +94,5 @@ def read_clean_clip(recording: Path) -> CleanClip | None:
         with h5py.File(path) as file:
             return CleanClip(file["clean"][:], file["time_s"][:])
     except (OSError, KeyError) as error:
-        raise ValueError(f"{path} must be the truth that src.simulate writes: {error}") from None
+        wanted = f"the truth that `{COMMAND}simulate` writes"
+        raise ValueError(f"{path} must be {wanted}: {error}") from None

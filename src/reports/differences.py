@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from statistics import fmean
 from typing import Any
 
@@ -34,11 +35,13 @@ def build_difference_table(
     heads = ("metric", "ours", "theirs", "ours - theirs", "95 % bootstrap CI", "published")
     table = Table(title, [Column(head, head) for head in heads], [], 1)
     rows = [find_published(side[0], published) for side in (ours, theirs)]
+    scenes = set[int]()
     for metric in list_metrics([*ours, *theirs]):
         compared = compare_clips(left_clips, right_clips, metric.name)
         if compared is None or (names is not None and metric.name not in names):
             continue
-        left, right, (low, high) = compared
+        scenes.add(compared.scenes)
+        (left, right), (low, high) = (compared.ours, compared.theirs), compared.interval
         first, second = (row.get(metric.name) for row in rows)
         digits = metric.digits + 1
         texts = [metric.heading, *(f"{value:.{digits}f}" for value in (left, right))]
@@ -48,7 +51,7 @@ def build_difference_table(
         texts.append("-" if change is None else f"{change:+.{digits}f}")
         table.rows.append([TableCell(text=text) for text in texts])
     table.note = f"{len(left_clips[0])} clips; {len(ours)} runs against {len(theirs)}.{left_out}"
-    table.note += describe_few_scenes([len(set(list_sources(left_clips[0])))])
+    table.note += describe_few_scenes(scenes)
     if len(ours) != len(theirs) and 1 in (len(ours), len(theirs)):
         table.note += " The CI has no spread over seeds of the single run."
     labels = list(zip(settings, *(group.label for group in groups), strict=True))
@@ -108,12 +111,19 @@ def _list_clip_names(run: Run) -> tuple[tuple[str, str | None], ...]:
     return tuple((clip["name"], clip.get("frames")) for clip in run.clips)
 
 
-def compare_clips(
-    ours: ClipsOfRuns, theirs: ClipsOfRuns, metric: str
-) -> tuple[float, float, tuple[float, float]] | None:
-    """Return the mean of each side over the clips that have such a score in all runs, and the CI of
-    their difference; None where none has.
-    """
+@dataclass(frozen=True)
+class Comparison:
+    """The means of two sides over the same clips, the CI of their difference, and how many
+    photographs or scenes it resamples."""
+
+    ours: float
+    theirs: float
+    interval: tuple[float, float]
+    scenes: int
+
+
+def compare_clips(ours: ClipsOfRuns, theirs: ClipsOfRuns, metric: str) -> Comparison | None:
+    """Compare the clips that have such a score in all runs; None where none has."""
     scored = [n for n, same in enumerate(zip(*ours, *theirs, strict=True))
               if all(metric in clip for clip in same)]  # fmt: skip
     if not scored:
@@ -124,5 +134,5 @@ def compare_clips(
     compared = [ours[0][n] for n in scored]
     weights, groups = frame_weights(compared), list_sources(compared)
     interval = bootstrap_difference_interval(left, right, weights, groups)
-    means = [fmean(fmean(row, weights) for row in side) for side in (left, right)]
-    return means[0], means[1], interval
+    first, second = (fmean(fmean(row, weights) for row in side) for side in (left, right))
+    return Comparison(first, second, interval, len(set(groups)))

@@ -4,7 +4,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 from src.metrics.table import Column
-from src.records.results import list_sources
 from src.records.runs import Run
 from src.reports.clip_conditions import find_differing_test_conditions, is_test_condition
 from src.reports.differences import compare_clips, keep_common_seeds, pool_same_clips
@@ -15,13 +14,13 @@ from src.reports.tables import Table, TableCell, check_columns, list_metrics
 
 @dataclass
 class _Difference:
-    """The cells of a row, a metric each; the numbers of clips and of photographs or scenes that
-    they show, 0 where a side is missing; sentences on the two groups.
+    """The cells of a row, a metric each; the number of clips, 0 where a side is missing, those
+    of photographs or scenes that the cells resample; sentences on the two groups.
     """
 
     cells: list[TableCell]
     clips: int = 0
-    scenes: int = 0
+    scenes: set[int] = field(default_factory=set)
     note: str = ""
     groups: list[RunGroup] = field(default_factory=list)
 
@@ -60,7 +59,7 @@ def build_pair_table(
         raise ValueError(f"pairs must have results of both on the same clips, got none of {listed}")
     table.note = f"{' or '.join(map(str, counts))} test clips; mean (95 % bootstrap CI); "
     table.note += "bold: the CI excludes zero."
-    table.note += describe_few_scenes(difference.scenes for _, difference in compared)
+    table.note += describe_few_scenes({n for _, difference in compared for n in difference.scenes})
     table.note += "".join(dict.fromkeys(difference.note for _, difference in compared))
     finished = {id(group): group for _, difference in compared for group in difference.groups}
     table.note += describe_runs(keys, list(finished.values()))
@@ -77,10 +76,10 @@ def _compare_pair(
     ours, theirs, left_out = keep_common_seeds(*(side.runs for side in both))
     pooled = pool_same_clips("pairs", ours, theirs)
     found = [compare_clips(*pooled, metric.name) for metric in metrics]
-    cells = [TableCell(f[0] - f[1], interval=f[2]) if f else TableCell() for f in found]
+    cells = [TableCell(f.ours - f.theirs, interval=f.interval) if f else TableCell() for f in found]
     note = left_out + describe_conditions(_find_other_conditions(setting, ours, theirs))
-    clips = pooled[0][0]
-    return _Difference(cells, len(clips), len(set(list_sources(clips))), note, both)
+    scenes = {f.scenes for f in found if f}
+    return _Difference(cells, len(pooled[0][0]), scenes, note, both)
 
 
 def _pair_groups(

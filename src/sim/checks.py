@@ -13,8 +13,7 @@ def check_in_range(key: str, value: Any, low: float, high: float) -> None:
     is_number = isinstance(value, Real)
     if not (is_number and low <= value <= high):
         bounds = f">= {low:.5g}" if high == math.inf else f"in [{low:.5g}, {high:.5g}]"
-        got = repr(value) if isinstance(value, str) else value
-        raise ValueError(f"{key} must be {bounds}, got {got}")
+        raise ValueError(f"{key} must be {bounds}, got {value}")
 
 
 def is_range(ends: Any) -> bool:

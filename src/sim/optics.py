@@ -7,9 +7,11 @@ sub-apertures; rows count downwards.  Axes: see docs/conventions.md.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from numbers import Integral
+from numbers import Integral, Real
 from operator import index
 from typing import Any
+
+from torch import Tensor
 
 Position = tuple[int, int]
 REACH = 8  # a grid position lies in -REACH..REACH
@@ -62,14 +64,22 @@ def most_central_view_index(positions: Sequence[Position]) -> int:
     return min(range(len(positions)), key=lambda i: sum(axis**2 for axis in positions[i]))
 
 
-def check_positions(positions: Any) -> None:
-    """Raise ValueError unless `positions` are pairs (row, col) of numbers."""
+def check_positions(positions: Any, views: int | None = None) -> None:
+    """Raise ValueError unless `positions` are pairs (row, col) of numbers, one for each of `views`;
+    None: however many."""
     try:
-        fits = all(not isinstance(pair, str) and len([*map(int, pair)]) == 2 for pair in positions)
-    except (TypeError, ValueError, OverflowError):
+        fits = all(len(pair) == 2 and all(map(_is_axis, pair)) for pair in positions)
+    except TypeError:
         fits = False
     if not fits:
         raise ValueError(f"positions must be the (row, col) of each view, got {positions}")
+    if views not in (None, len(positions)):
+        got = f"{len(positions)}: {list(positions)}"
+        raise ValueError(f"positions must be {views} (row, col), one for each view, got {got}")
+
+
+def _is_axis(value: Any) -> bool:
+    return isinstance(value, Real | Tensor)
 
 
 def _is_position(value: Any) -> bool:

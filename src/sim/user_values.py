@@ -33,7 +33,10 @@ def read_array(name: str, values: Any) -> np.ndarray:
 
 def is_number(value: Any) -> bool:
     """Return whether `value` is one real number, of Python, NumPy or PyTorch."""
-    array = np.asarray(value)
+    try:
+        array = np.asarray(value)
+    except (RuntimeError, TypeError, ValueError):  # a tensor on a GPU, in bf16, or with a gradient
+        return False
     return array.ndim == 0 and array.dtype.kind in "iuf"
 
 

@@ -81,12 +81,12 @@ def type_command(monkeypatch, tmp_path, *overrides):
     [
         (["width=12"], "width must be 16, as in start=single256, got 12"),
         (["model.base_channels=12"], "model.base_channels must be 16, as in"),
-        (["stem=null"], "stem must be 32, as in start=single256, got None"),
+        (["stem=null"], "stem must be 32, as in start=single256, got null"),
         (["state_rounding_step=0.5"], "state_rounding_step must be 0.25, as in .*, got 0.5"),
         (["model.recurrent=convgru"], "model.recurrent must be convlstm, as in .*, got convgru"),
         (
             ["experiment=setnet_small", "start=setnet_small", "model=setnet_large"],
-            "model must be that of start=setnet_small, got size = large",
+            "model must have channels=16, .*as in start=setnet_small, got channels=24, ",
         ),
     ],
 )

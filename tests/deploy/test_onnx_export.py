@@ -66,8 +66,8 @@ def test_pienet_lite_is_exported(tmp_path):
     pytest.importorskip("onnxruntime", reason="needs the extra onnx")
     pytest.importorskip("onnxscript", reason="needs the extra onnx")
     torch.manual_seed(0)
-    network = PIENet(channels=(16, 24), pools=(2, 2)).eval()
-    found = export_onnx(network, tmp_path / "net.onnx", views=1, height=40, width=40)
+    network = PIENet(base_channels=12, channels=(16, 24), pools=(2, 2)).eval()
+    found = export_onnx(network, tmp_path / "net.onnx", views=1, height=48, width=40)
     assert found.views == 1
 
 

@@ -304,7 +304,7 @@ ROW = {"positions": [(0, k) for k in range(9)]}
         (
             "e2vid",
             {"positions": layout(4)},
-            "^positions must be 9 .row, col. for this network, got 4",
+            "^positions must be 9 .row, col., one for each view, got 4",
         ),
         ("e2vid", ROW, "^positions must be arranged as .* for this network, got .*, 8"),
         ("e2vid", {"positions": [(0, 0)] * 9}, "^positions must be arranged as"),

@@ -504,7 +504,7 @@ def test_windows_that_overlap_are_those_of_reconstruct_to_the_event():
 
 def test_live_windows_do_not_grow():
     settings = RunSettings(12_000.0, window_length="growing", form="float32")
-    with pytest.raises(ValueError, match="must be frame or trained for src.live, got growing"):
+    with pytest.raises(ValueError, match="must be frame or trained for `.*live`, got growing"):
         NetworkRunner("net", SetNet.preset("small"), scenes.views(), settings)
 
 

@@ -128,7 +128,7 @@ def test_other_views_or_bins_are_refused(shape):
     ("options", "message"),
     [
         ({"positions": layout(2)[::-1]}, r"^positions must be in the order \[\(0, 0\), \(0, 1\)\]"),
-        ({"positions": [(7, 7)] * 3}, r"^positions must be 2 \(row, col\) for this network, got 3"),
+        ({"positions": [(7, 7)] * 3}, r"^positions must be 2 \(row, col\), one .*, got 3"),
         ({"window_s": -1.0}, "^window_s must be > 0 seconds, got -1.0"),
         ({"window_s": math.nan}, "^window_s must be > 0 seconds, got nan"),
         ({"window_s": torch.tensor([0.1, 0.0])}, "^window_s must be > 0 seconds, got .*0.0"),

@@ -163,7 +163,7 @@ def test_what_no_video_can_be_written_of_is_named(tmp_path):
     masked = np.ma.masked_array(frame, True)
     for given, message in (
         ((None, [frame], 30), "path must be a path, got a NoneType"),
-        ((tmp_path / "a.mp4", [frame], "30"), r"fps must be in \[0.1, 1000\], got '30'"),
+        ((tmp_path / "a.mp4", [frame], "30"), "fps must be a number, got '30'"),
         ((tmp_path / "a.mp4", [masked], 30), "frames must be without a mask, got a masked array"),
     ):
         with pytest.raises(ValueError, match=f"^{message}"):

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 import yaml
 
+from src import COMMAND
 from src.records import safe_yaml
 from src.sim.optics import Position
 from src.sim.turbulence import prior
@@ -91,7 +92,7 @@ class TurbulenceFile:
 
 def read_turbulence_file(path: Path | str | None) -> TurbulenceFile:
     """Read a file; raises ValueError, one line, for none and for one that holds something else."""
-    wrong = f"turbulence.measured must be a file of src.calibrate task=air, got {path}"
+    wrong = f"turbulence.measured must be a file of `{COMMAND}calibrate task=air`, got {path}"
     if path is None:
         raise ValueError(wrong)
     try:
