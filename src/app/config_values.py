@@ -7,6 +7,7 @@ mapping.  What is null there, or may be of several kinds, is listed below.
 import math
 import re
 from collections.abc import Iterator
+from functools import lru_cache
 from typing import Any, cast
 
 from hydra.core.global_hydra import GlobalHydra
@@ -129,7 +130,15 @@ def _shipped_config() -> DictConfig | None:
     parser = OverridesParser.create()
     given = [(line, parser.parse_override(line).key_or_group) for line in job.overrides.task]
     chosen = [line for line, group in given if loader.get_group_options(group)]
-    shipped = loader.load_configuration(job.job.config_name, chosen, RunMode.RUN)
+    sources = tuple(f"{source.provider}: {source.path}" for source in loader.get_sources())
+    return _compose_choices(job.job.config_name, tuple(chosen), sources)
+
+
+@lru_cache(maxsize=64)  # jobs of a sweep that differ in values alone have the same
+def _compose_choices(name: str | None, chosen: tuple[str, ...], _: tuple[str, ...]) -> DictConfig:
+    """`_`: the folders in which the loader finds configs."""
+    loader = GlobalHydra.instance().config_loader()
+    shipped = loader.load_configuration(name, list(chosen), RunMode.RUN)
     OmegaConf.set_struct(shipped, False)
     shipped.pop("hydra", None)
     return shipped

@@ -4,6 +4,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from src import simulate
+from src.app import config_values
 from src.app.config_values import LIST, NULL, NUMBER, WORD, _kinds_like
 from tests.test_entry_points import run_here
 
@@ -89,6 +90,13 @@ def test_one_line_and_exit_code_2(name, overrides, said, tmp_path, capsys):
     printed = capsys.readouterr()
     (line,) = printed.err.splitlines()
     assert line.startswith("error: ") and said in line and printed.out == ""
+
+
+def test_the_shipped_config_is_composed_once_for_the_same_choices(tmp_path):
+    config_values._compose_choices.cache_clear()
+    for words in (["width=a"], ["stem=b"], ["width=a", "optics=single"]):
+        assert run_here("train", *words, f"paths.out={tmp_path}") == 2
+    assert config_values._compose_choices.cache_info().misses == 2
 
 
 def test_a_recording_that_cannot_be_written_is_refused_before_it_is_made(tmp_path, monkeypatch):
