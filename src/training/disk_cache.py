@@ -6,6 +6,7 @@ While a process simulates it, its byte of a lock file is locked by the system.
 
 import ast
 import fcntl
+import functools
 import hashlib
 import json
 import multiprocessing
@@ -170,8 +171,13 @@ def _fill_caches(caches: Sequence[DiskClipCache]) -> None:
 
 def hash_simulation_code() -> str:
     """Return a hash of the code and tables that make clips: comments and layout do not count."""
+    return _hash_simulation_code(MEASURED)
+
+
+@functools.cache
+def _hash_simulation_code(measured: str) -> str:
     home, digest = Path(src.sim.__file__).parent, hashlib.sha256()
-    digest.update(_hash_input(home.parent / MEASURED))
+    digest.update(_hash_input(home.parent / measured))
     for path in sorted(home.rglob("*")):
         place = path.relative_to(home)
         if any(map(place.is_relative_to, NOT_HASHED)) and place.as_posix() != UPSTREAM:

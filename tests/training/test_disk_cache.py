@@ -429,3 +429,9 @@ def test_the_file_that_draws_measured_turbulence_is_in_the_hash(monkeypatch):
     before = hash_simulation_code()
     monkeypatch.setattr(disk_caches, "MEASURED", "recordings/files/time_unit.py")
     assert hash_simulation_code() != before
+
+
+def test_code_is_hashed_once_a_process(monkeypatch):
+    before = hash_simulation_code()
+    monkeypatch.setattr(disk_caches, "_hash_input", None)
+    assert hash_simulation_code() == before
