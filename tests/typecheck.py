@@ -1,5 +1,5 @@
-"""The run-time checks of annotations in tests: beartype's, with an int accepted as a float, and those
-of shapes of arrays in a context of jaxtyping's, in which an axis has one size.
+"""The run-time checks of annotations in tests: beartype's, with an int accepted as a float, and
+those of shapes of arrays in a context of jaxtyping's, in which an axis has one size.
 """
 
 import inspect
