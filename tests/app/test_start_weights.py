@@ -86,7 +86,7 @@ def type_command(monkeypatch, tmp_path, *overrides):
         (["model.recurrent=convgru"], "model.recurrent must be convlstm, as in .*, got convgru"),
         (
             ["experiment=setnet_small", "start=setnet_small", "model=setnet_large"],
-            "model must have channels=16, .*as in start=setnet_small, got channels=24, ",
+            "model must have channels=16, .*as in start=setnet_small, got channels=64, ",
         ),
     ],
 )

@@ -11,7 +11,7 @@ from scipy.optimize import OptimizeResult, least_squares
 from src.recordings.calibration.scene_matches import ViewMatches
 from src.recordings.calibration.view_field import Rectangle
 from src.recordings.calibration.view_grid import OTHER_GRIDS
-from src.recordings.corner_fold import CornerFold
+from src.recordings.corner_fold import MAX_ANGLE_RAD, CornerFold
 from src.recordings.views import View
 from src.sim.optics import Position
 
@@ -89,7 +89,10 @@ def _fit(
     def view(change: np.ndarray) -> View:
         moved = np.eye(3) + np.append(change[:8], 0).reshape(3, 3)
         matrix = back @ moved @ shape @ start
-        turned = replace(fold, angle_rad=float(change[8])) if fold else None
+        turned = None
+        if fold:
+            angle = np.clip(change[8], -MAX_ANGLE_RAD, MAX_ANGLE_RAD)
+            turned = replace(fold, angle_rad=float(angle))
         return View(position, matrix / matrix[2, 2], fold=turned)
 
     def errors(change: np.ndarray) -> np.ndarray:
