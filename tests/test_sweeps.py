@@ -39,15 +39,6 @@ def jobs(path: Path) -> list[list[str]]:
     return BasicSweeper.split_arguments(parsed, max_batch_size=None)[0]
 
 
-def choose_jobs(found: list[list[str]]) -> list[list[str]]:
-    """Few jobs which together have every override of a sweep."""
-    left, chosen = {override for job in found for override in job}, []
-    while left:
-        chosen.append(max(found, key=lambda job: len(left.intersection(job))))
-        left -= set(chosen[-1])
-    return chosen
-
-
 def composed(path: Path, run: Path, *overrides: str) -> DictConfig:
     """The config of a job of the sweep `path`, as `--config-dir sweeps` makes it."""
     rest = [f"hydra.searchpath=[file://{ROOT / 'conf'}]", f"paths.out={run}"]
@@ -80,8 +71,8 @@ def test_every_job_composes_and_the_last_runs(path, tmp_path, weights):
     assert "sweep" not in sweep["hydra"]  # the folder follows from the name: conf/hydra
     found = jobs(path)
     assert len(found) == len({tuple(job) for job in found}) >= 3
-    for job in choose_jobs(found):
-        composed(path, tmp_path, *job)
+    for override in {override for job in found for override in job}:
+        composed(path, tmp_path, override)
     tiny, work = {
         "train": ([*TINY, "logger=none"], train),
         "eval": (SMALL, evaluate),

@@ -15,6 +15,7 @@ from src.models.checkpoints import newest_checkpoint
 from src.models.e2vid import E2VID
 from src.models.network import VideoMethod
 from src.records import safe_yaml
+from src.reports.clip_conditions import format_setting
 
 UNIT_NORM_TOLERANCE = 0.05  # of gates trained with spectral norm, whose estimate lags behind
 
@@ -55,24 +56,25 @@ def set_model_from_start_weights(cfg: DictConfig) -> Path | None:
         views = cfg.optics.views
         if kwargs.get("views", 1) not in (1, views):
             raise ValueError(f"start must be weights of 1 or {views} views, got {kwargs['views']}")
-        kwargs |= {"views": views, "spectral_norm": _keeps_spectral_norm(cfg, path)}
+        kwargs |= {"views": views, "spectral_norm": _choose_spectral_norm(cfg, path)}
     _refuse_other_typed_values(cfg, kwargs)
     OmegaConf.update(cfg, "model", {"_target_": got, **kwargs}, merge=False)
     return path
 
 
 @torch.no_grad()
-def _keeps_spectral_norm(cfg: DictConfig, path: Path) -> bool:
-    """Return `model.spectral_norm`, but False, with a line, for gates of another norm than one in
-    the file `path` of an E2VID, unless it is typed."""
+def _choose_spectral_norm(cfg: DictConfig, path: Path) -> bool:
+    """Return `model.spectral_norm` for the training; False, with a line, for gates of another norm
+    than one in the file `path` of an E2VID, unless it is typed."""
     if not cfg.model.get("spectral_norm"):
         return False
+    if entry_point.is_set_on_command_line("model.spectral_norm"):
+        return True
     network = files.load(path)
     assert isinstance(network, E2VID)
     norms = [float(torch.linalg.matrix_norm(gate.weight.flatten(1), 2)) for gate in network.gates]
     unlike = max(norms, key=lambda norm: abs(norm - 1))
-    is_kept = abs(unlike - 1) <= UNIT_NORM_TOLERANCE
-    if is_kept or entry_point.is_set_on_command_line("model.spectral_norm"):
+    if abs(unlike - 1) <= UNIT_NORM_TOLERANCE:
         return True
     print(f"start has gates of norm {unlike:.3g}: model.spectral_norm=false", file=sys.stderr)
     return False
@@ -88,8 +90,8 @@ def _refuse_other_typed_values(cfg: DictConfig, kwargs: dict[str, Any]) -> None:
         if name not in kwargs:
             _refuse_other_preset(cfg, key, kwargs)
         elif value != kwargs[name]:
-            wanted = f"{_as_typed(kwargs[name])}, as in start={cfg.start}"
-            raise ValueError(f"{key} must be {wanted}, got {_as_typed(value)}")
+            wanted = f"{format_setting(kwargs[name])}, as in start={cfg.start}"
+            raise ValueError(f"{key} must be {wanted}, got {format_setting(value)}")
 
 
 def _refuse_other_preset(cfg: DictConfig, key: str, kwargs: dict[str, Any]) -> None:
@@ -98,7 +100,7 @@ def _refuse_other_preset(cfg: DictConfig, key: str, kwargs: dict[str, Any]) -> N
     other = [name for name in kwargs if built.get(name) != kwargs[name]]
     if other:
         wanted, got = (
-            ", ".join(f"{name}={_as_typed(values.get(name))}" for name in other)
+            ", ".join(f"{name}={format_setting(values.get(name))}" for name in other)
             for values in (kwargs, built)
         )
         raise ValueError(f"{key} must have {wanted}, as in start={cfg.start}, got {got}")
@@ -112,12 +114,6 @@ def _find_typed_key(cfg: DictConfig, name: str) -> str | None:
     keys = [f"model.{name}", str(written[name]).removeprefix("${").removesuffix("}")]
     keys += ["model"] if cfg.model._target_.endswith(".preset") else []
     return next((key for key in keys if entry_point.is_set_on_command_line(key)), None)
-
-
-def _as_typed(value: Any) -> str:
-    return (
-        "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
-    )
 
 
 def _network_arguments(cfg: DictConfig) -> dict[str, Any]:

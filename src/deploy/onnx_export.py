@@ -1,10 +1,6 @@
 """A network as an ONNX file with its state as explicit inputs and outputs, and back to run it.
 
-A file is for one number of views, one size of picture and one clip at a time.  Inputs, float32:
-`voxels` (1, views, bins, h, w), `window_s` (1,) in seconds, where the network uses it, and
-`state0`, `state1`, ..., zeros for the first window; outputs: `frame` (1, 1, h, w) and `after0`,
-`after1`, ..., the states for the next window.  Needs the extra `onnx`: pip install onnx onnxruntime
-onnxscript.
+Needs the extra `onnx`: pip install onnx onnxruntime onnxscript.
 """
 
 import contextlib

@@ -36,8 +36,8 @@ def bootstrap_difference_interval(
 
     Groups of clips are resampled, in both at once; what the seeds add is independent in the two,
     Student's t of seeds - 1 degrees of freedom (0 for one seed).  None stands for zero.  Always the
-    same draws.  Of few groups it is narrow: `compute_coverage` says how often it holds the mean.
-    Raises ValueError for rows of different lengths.
+    same draws.  Of few groups it is narrow: `compute_interval_coverage` says how often it holds the
+    mean.  Raises ValueError for rows of different lengths.
     """
     rng = np.random.default_rng(0)
     clips = len(ours[0])
@@ -57,13 +57,14 @@ def bootstrap_difference_interval(
     return float(low), float(high)
 
 
-def compute_coverage(groups: int) -> float:
+def compute_interval_coverage(groups: int) -> float:
     """Return the share of cases, about, in which the interval of one seed over so many `groups`
     (2 or more) holds the mean: 0.5 of two, 0.75 of three, 0.90 of nine, 0.91 of twelve, 0.93 of 27.
 
     Of normal values, whose resampled means spread by sqrt((G - 1) / G) of the standard error of G:
     P(|t| < 1.96 sqrt((G - 1) / G)) with Student's t of G - 1 degrees of freedom.  Of two groups the
-    ends are the two values.  Raises ValueError for fewer.
+    ends are the two values.  tests/metrics/test_bootstrap.py compares it with draws.  Raises
+    ValueError for fewer.
     """
     if groups < 2:
         raise ValueError(f"groups must be >= 2, got {groups}")

@@ -61,7 +61,7 @@ def temporal_jitter_px(frames: Video, target: Video) -> Float[Tensor, " frames-1
 
     Blur of what moves reads as jitter, too: Gaussian blur of sigma 2 and 4 px alone as 0.1 and
     0.3 px on a photograph that moves 0.8 px a frame, as 0.3 and 0.7 px on one that moves 2.3; of
-    what rests as 0.
+    what rests as 0 (tests/metrics/test_temporal.py).
     A block counts as much as its weaker weight in the two frames; 0 where `find_textured_pairs`
     has none.
     """

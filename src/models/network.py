@@ -116,7 +116,7 @@ def check_voxel_shape(voxels: Tensor) -> None:
         raise ValueError(f"{wanted}, got {tuple(voxels.shape)}")
 
 
-def check_state_alone(state: Any) -> None:
+def refuse_frame_with_state(state: Any) -> None:
     """Raise ValueError for the pair (frame, state) that a network returns, given as its state."""
     is_pair = isinstance(state, tuple) and len(state) == 2
     if is_pair and isinstance(state[0], Tensor) and not isinstance(state[1], Tensor):
@@ -126,7 +126,7 @@ def check_state_alone(state: Any) -> None:
 def check_state_sizes(state: Any, sizes: Sequence[tuple[int, ...]]) -> None:
     """Raise ValueError unless the tensors of `state`, in order, have these `sizes`, and for the
     pair (frame, state)."""
-    check_state_alone(state)
+    refuse_frame_with_state(state)
     found = [tuple(getattr(leaf, "shape", ())) for leaf in pytree.tree_leaves(state)]
     if found != list(sizes):
         raise ValueError(f"state must have sizes {list(sizes)} for these voxels, got {found}")

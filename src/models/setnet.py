@@ -72,9 +72,9 @@ from src.models.context_pyramid import ContextPyramid, smooth_context
 from src.models.layers import EqualDCConv, pad_centred_to_multiple, scan_windows
 from src.models.network import (
     EventToVideoNetwork,
-    check_state_alone,
     check_voxel_shape,
     check_window_length,
+    refuse_frame_with_state,
 )
 from src.models.setnet_state import Context, SetNetState
 from src.models.time_gated_memory import TimeGatedMemory
@@ -327,7 +327,7 @@ class SetNet(EventToVideoNetwork):
         )
         if state is None:
             return zeros
-        check_state_alone(state)
+        refuse_frame_with_state(state)
         found, sizes = _sizes(state), _sizes(zeros)
         if found != sizes:
             raise ValueError(f"state must have sizes {sizes} for these voxels, got {found}")

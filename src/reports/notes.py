@@ -3,7 +3,7 @@ out."""
 
 from collections.abc import Iterable, Sequence
 
-from src.metrics.bootstrap import compute_coverage
+from src.metrics.bootstrap import compute_interval_coverage
 from src.records.runs import Run
 from src.reports.clip_conditions import format_setting
 from src.reports.run_groups import RunGroup, find_differing_defaults
@@ -39,7 +39,7 @@ def describe_few_scenes(counts: Iterable[int]) -> str:
     few = sorted({count for count in counts if 1 < count < FEW_SCENES})
     if not few:
         return ""
-    held = dict.fromkeys(f"{100 * compute_coverage(count):.0f}" for count in few)
+    held = dict.fromkeys(f"{100 * compute_interval_coverage(count):.0f}" for count in few)
     shown = " or ".join(map(str, few))
     return (
         f" Of {shown} photographs or scenes such a CI holds one seed's mean in about "

@@ -68,7 +68,7 @@ def check_positions(positions: Any, views: int | None = None) -> None:
     """Raise ValueError unless `positions` are pairs (row, col) of numbers, one for each of `views`;
     None: however many."""
     try:
-        fits = all(len(pair) == 2 and all(map(_is_axis, pair)) for pair in positions)
+        fits = all(_is_pair(pair, Real, Tensor) for pair in positions)
     except TypeError:
         fits = False
     if not fits:
@@ -78,13 +78,9 @@ def check_positions(positions: Any, views: int | None = None) -> None:
         raise ValueError(f"positions must be {views} (row, col), one for each view, got {got}")
 
 
-def _is_axis(value: Any) -> bool:
-    return isinstance(value, Real | Tensor)
-
-
-def _is_position(value: Any) -> bool:
-    is_pair = hasattr(value, "__len__") and len(value) == 2
-    return is_pair and all(isinstance(axis, Integral) for axis in value)
+def _is_pair(value: Any, *kinds: type) -> bool:
+    has_two = hasattr(value, "__len__") and len(value) == 2
+    return has_two and all(isinstance(axis, kinds) for axis in value)
 
 
 def view_id(position: Position) -> int:
@@ -104,7 +100,7 @@ class Optics:
 
     def __post_init__(self):
         chosen = self.positions or layout(self.views)
-        if not (isinstance(chosen, Sequence) and all(map(_is_position, chosen))):
+        if not (isinstance(chosen, Sequence) and all(_is_pair(one, Integral) for one in chosen)):
             allowed = "a list of (row, col), whole numbers"
             raise ValueError(f"optics.positions must be {allowed}, got {chosen}")
         positions = tuple((int(row), int(col)) for row, col in chosen)

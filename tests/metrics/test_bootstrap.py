@@ -8,7 +8,7 @@ from src.metrics.bootstrap import (
     RESAMPLES,
     bootstrap_difference_interval,
     bootstrap_interval,
-    compute_coverage,
+    compute_interval_coverage,
 )
 
 
@@ -43,13 +43,20 @@ def test_how_often_it_holds_the_mean_is_what_is_computed(clips):
     for _ in range(1000):
         low, high = bootstrap_interval((0.5 + rng.normal(size=clips)).tolist())
         held += low <= 0.5 <= high
-    assert compute_coverage(clips) == pytest.approx(held / 1000, abs=0.03)
+    assert compute_interval_coverage(clips) == pytest.approx(held / 1000, abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("clips", "stated"), [(2, 0.5), (3, 0.75), (9, 0.90), (12, 0.91), (27, 0.93)]
+)
+def test_how_often_it_holds_the_mean_is_what_is_stated(clips, stated):
+    assert compute_interval_coverage(clips) == pytest.approx(stated, abs=0.005)
 
 
 def test_of_many_clips_it_holds_the_mean_in_95_of_100_cases_and_one_has_none():
-    assert compute_coverage(10_000) == pytest.approx(0.95, abs=0.001)
+    assert compute_interval_coverage(10_000) == pytest.approx(0.95, abs=0.001)
     with pytest.raises(ValueError, match="groups must be >= 2, got 1"):
-        compute_coverage(1)
+        compute_interval_coverage(1)
 
 
 def test_of_three_seeds_it_holds_the_difference_as_often_as_it_says():
