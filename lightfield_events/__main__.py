@@ -14,6 +14,7 @@ COMMANDS = (
 def main() -> None:
     """Run `src.<command>` with the rest of the command line."""
     import src
+    from src.app.help import show_help
 
     src.shorten_interruption()
     name = sys.argv[1] if len(sys.argv) > 1 else "--help"
@@ -26,6 +27,8 @@ def main() -> None:
         sys.exit(1)
     file = str(Path(src.__path__[0]) / f"{name}.py")
     sys.argv[:2] = [file]
+    if show_help(name, Path(file)):
+        return
     run_module(f"{src.__name__}.{name}", run_name="__main__", alter_sys=True)
 
 

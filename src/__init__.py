@@ -2,6 +2,7 @@
 
 import os
 import sys
+from pathlib import Path
 from types import TracebackType
 
 # The largest picture that is read: OpenCV looks at this when it is imported, so before all else.
@@ -33,5 +34,16 @@ def _show_exception(
         sys.__excepthook__(kind, error, trace)
 
 
+def _show_help() -> None:
+    """Print the help of `python -m src.<name> --help` and end, before seconds of imports."""
+    from src.app.help import show_help
+
+    package, _, name = sys.orig_argv[-len(sys.argv)].rpartition(".")
+    file = Path(__file__).with_name(f"{name}.py")
+    if package == "src" and file.is_file() and show_help(name, file):
+        sys.exit()
+
+
 if sys.argv[:1] == ["-m"]:  # while Python looks for the module of `python -m src.<name>`
     shorten_interruption()
+    _show_help()

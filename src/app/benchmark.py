@@ -16,7 +16,7 @@ from rich.table import Table
 from baselines import published
 from baselines.centre_view import CentreViewNetwork
 from src.app import entry_point, methods
-from src.app.compose import CONF
+from src.app.config_files import CONF
 from src.app.hardware import first_requested_gpu
 from src.app.instantiate import as_dict, build_part
 from src.app.metrics import SHIPPED_METRIC_KEYS

@@ -1,4 +1,4 @@
-"""The folder of the configs, and configs made without a command line."""
+"""Configs made without a command line."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,6 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from src.app import console
+from src.app.config_files import CONF, config_choices
 from src.app.config_values import check_values_like
 from src.app.path_overrides import quote_paths, refuse_empty_paths
 from src.app.renamed_keys import (
@@ -18,13 +19,6 @@ from src.app.renamed_keys import (
     read_override_key,
     refuse_renamed_keys,
 )
-
-CONF = str(Path(__file__).resolve().parents[2] / "conf")
-
-
-def config_choices(group: str) -> list[str]:
-    """Return the names of the configs of a group such as turbulence."""
-    return sorted(file.stem for file in (Path(CONF) / group).glob("*.yaml"))
 
 
 def compose_config(name: str, *overrides: str) -> DictConfig:

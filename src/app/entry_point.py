@@ -21,9 +21,10 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from src.app import console
-from src.app.compose import CONF, describe_config_error
+from src.app.compose import describe_config_error
+from src.app.config_files import CONF
 from src.app.config_values import check_values
-from src.app.help import help_text
+from src.app.help import show_help
 from src.app.path_overrides import (
     name_job_folder,
     quote_paths,
@@ -67,8 +68,7 @@ def run_command(
             failures.append(error)  # Hydra would print it, and go on to raise it
 
     def run() -> None:
-        if {"--help", "-h"} & set(sys.argv[1:]) and "--config-name" not in sys.argv:
-            print(help_text(config, sys.modules[work.__module__].__doc__ or ""))
+        if show_help(config, Path(work.__code__.co_filename)):
             return
         main()
         if failures:

@@ -1,15 +1,33 @@
 """What `--help` prints: what a command does, the choices of its groups, its keys with comments."""
 
+import ast
 import re
+import sys
+from contextlib import suppress
 from pathlib import Path
 
 from src import COMMAND
-from src.app.compose import CONF, config_choices
+from src.app import console
+from src.app.config_files import CONF, config_choices
 
 CHOICE = re.compile(r"- (?:override )?/?(\w+)(?:@(\w+))?: *([\w/]+)(?: +# *(.*))?")
 FOOT = """\
 Any key can be given as key=value, those of a group too: --cfg job --resolve prints them all.
 -m runs a sweep over values with commas; --hydra-help lists the options of Hydra."""
+
+
+def show_help(config: str, file: Path) -> bool:
+    """Print the help of the command in `file`, of conf/<config>.yaml, where the command line has
+    --help or -h; return whether it has.
+    """
+    words = sys.argv[1:]
+    if not {"--help", "-h"} & set(words) or "--config-name" in words:
+        return False
+    console.prepare_streams()
+    usage = ast.get_docstring(ast.parse(file.read_text("utf-8"))) or ""
+    with suppress(BrokenPipeError):  # as `| head` leaves it
+        print(help_text(config, usage), flush=True)
+    return True
 
 
 def help_text(config: str, usage: str) -> str:

@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from src.app.compose import compose_checked_config, config_choices
+from src.app.compose import compose_checked_config
+from src.app.config_files import config_choices
 from src.app.renamed_keys import read_override_key
 from src.app.user_clip_simulation import (
     UserClipSimulation,

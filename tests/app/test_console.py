@@ -5,6 +5,7 @@ import os
 import pty
 import re
 import select
+import subprocess
 import sys
 import time
 from unittest.mock import Mock
@@ -61,6 +62,14 @@ def test_every_command_has_help(command, capsys):
     assert run_here(command, "--help") == 0
     said = capsys.readouterr().out
     assert "seed: 0  " in said and f"python -m src.{command}" in said
+
+
+def test_help_comes_before_the_imports_of_a_command():
+    command = [sys.executable, "-X", "importtime", "-m", "src.train", "--help"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("Train a network") and "seed: 0  " in done.stdout
+    loaded = {line.rpartition("|")[2].strip() for line in done.stderr.splitlines()}
+    assert "src.app.help" in loaded and not loaded & {"torch", "lightning", "hydra", "src.train"}
 
 
 @pytest.mark.parametrize(
