@@ -31,7 +31,8 @@ from src.recordings.views import Views
 from src.records import results
 from src.train import fit
 
-SMALL = ["debug=fdr", "loss=l1", "metrics.lpips=null", "logger=csv", "~callbacks.progress"]
+SMALL = ["debug=fdr", "loss=l1", "metrics.lpips=null", "logger=csv"]
+SMALL += ["trainer.enable_progress_bar=false"]
 SMALL += ["data.workers=1", "data.epoch_clips=40", "data.batch_reuse=1"]
 SMALL += ["trainer.max_steps=-1", "scheduler=null"]
 SIDE, EVENTS = 64, 200_000  # of the recording: pixels, events in 2 s

@@ -25,7 +25,7 @@ from src.records.results import ScoreRow
 from src.sim.pipeline import Sample
 from src.training.datamodule import LightFieldData
 from src.training.ema import load_ema_weights
-from src.training.learning_curve import continue_from_weights
+from src.training.learning_curve import check_hours_left, continue_from_weights
 from src.training.reconstructor import Reconstructor
 from src.training.step_guard import NonFiniteError
 
@@ -82,6 +82,8 @@ def _build_training(cfg: DictConfig, first_weights: Path | None) -> Training:
     if first_weights:
         files.restore_weights(net, first_weights)
     ckpt = files.find_checkpoint(cfg.ckpt, spec) if cfg.ckpt else None
+    if ckpt and files.is_weights_file(ckpt):
+        check_hours_left(cfg.train_hours, ckpt)
     module, data = build.build_reconstructor(cfg, net, spec), build.build_data_module(cfg)
     trainer = build.build_trainer(cfg)
     find_checkpoint_folder(trainer)  # or its error would come late
@@ -155,8 +157,10 @@ def fill_in_settings(cfg: DictConfig) -> Path | None:
 def fit(
     trainer: lightning.Trainer, module: Reconstructor, data: LightFieldData, ckpt: Path | None
 ) -> None:
-    """Train; when that is cut short, whatever by, print what to continue from."""
-    last = find_checkpoint_folder(trainer) / "last.ckpt"
+    """Train; when that is cut short, whatever by, print what to continue from.
+
+    Of several processes all use the folder of the first.
+    """
     if ckpt and files.is_weights_file(ckpt):
         continue_from_weights(module, trainer.callbacks, ckpt)  # type: ignore[attr-defined]
         ckpt = None
@@ -165,7 +169,8 @@ def fit(
         if not module.steps_so_far:
             limits = "trainer.max_steps, trainer.limit_train_batches and train_hours"
             raise ValueError(f"{limits} must let a training take a step, got none")
-        if not last.is_file():  # nothing was left to do
+        last = find_checkpoint_folder(trainer) / "last.ckpt"  # now that of the first process
+        if trainer.strategy.broadcast(not last.is_file()):  # nothing was left to do
             trainer.save_checkpoint(last)
 
 

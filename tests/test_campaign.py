@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -22,9 +23,9 @@ from src.models import files
 from src.models.e2vid import E2VID
 
 # Steps of 0.02 s, each with a checkpoint (a text file with the number of steps); as src.train, it
-# goes on from `ckpt=`, writes a curve, and at the end its results.
+# goes on from `ckpt=`, and writes weights and results at the end.
 FAKE = """
-import pathlib, sys, time
+import json, pathlib, struct, sys, time
 folder, hours, *rest = sys.argv[1:]
 run, all = pathlib.Path(folder), pathlib.Path(folder).parent
 (run / "checkpoints").mkdir(parents=True)
@@ -39,6 +40,8 @@ while steps < 10 * float(hours):
     with (top / "order.txt").open("a") as file:
         file.write(f"{all.parent.name} {steps}\\n")
     exec(fault)
+header = json.dumps({"__metadata__": {"network": "{}", "card": "{}"}}).encode()
+all.with_suffix(".safetensors").write_bytes(struct.pack("<Q", len(header)) + header)
 (run / "results.json").write_text("{}")
 """
 
@@ -185,6 +188,49 @@ def test_what_fails_thrice_is_given_up_and_the_others_go_on(tmp_path, fakes):
     assert [work.state() for work in given] == ["failed", "done"]
     failed = tmp_path / "a" / "training" / "failed.txt"
     assert failed.read_text() == "exit code 1: no\n"
+    why = f"; exit code 1: no; log: {tmp_path / 'a' / 'training' / 'log.txt'}"
+    assert given[0].line().endswith(why) and "failed" not in given[1].line()
+    assert len(list((tmp_path / "a" / "training").glob("part*"))) == 3
+
+
+def test_what_has_failed_is_tried_again_by_a_new_start(tmp_path, fakes):
+    fault = tmp_path / "fault.py"
+    fault.write_text("sys.exit(2)")
+    assert run(works(tmp_path, "a")) == 1
+    assert len(list((tmp_path / "a" / "training").glob("part*"))) == 1, "a wrong value stays wrong"
+    fault.unlink()
+    given = works(tmp_path, "a")
+    assert given[0].state() == "failed" and run(given) == 0 and given[0].state() == "done"
+
+
+def test_results_without_weights_are_not_done(tmp_path, fakes):
+    (work,) = works(tmp_path, "a")
+    assert run([work]) == 0
+    (training,) = work.trainings.values()
+    training.weights.unlink()
+    assert training.state() == "waiting"
+
+
+def test_a_look_at_a_training_does_not_stop_its_start(tmp_path, fakes):
+    (work,) = works(tmp_path, "a")
+    (training,) = work.trainings.values()
+    training.folder.mkdir(parents=True)
+    with (training.folder / "lock").open("a") as look:
+        fcntl.flock(look, fcntl.LOCK_SH)
+        assert not training.running(), "two may look at once"
+        threading.Timer(0.3, fcntl.flock, (os.dup(look.fileno()), fcntl.LOCK_UN)).start()
+        training.start([], None)
+    assert training.running()
+    training.process.wait()
+
+
+def test_a_start_says_which_stage_and_how_far(tmp_path, fakes, capsys):
+    assert run(works(tmp_path, "a")) == 0
+    assert (
+        capsys.readouterr()
+        .out.split("\n")[0]
+        .endswith(" a: running, training, 0.00 of 1 h, 0 steps")
+    )
 
 
 def test_status_says_how_far_each_is(tmp_path):
@@ -216,6 +262,18 @@ def test_only_one_campaign_works_in_a_folder(tmp_path, fakes):
         ("[{name: a, mean: {b: 1}}, {name: b, hours: 1}]", "among stages before it"),
         ("[{name: a, hours: 1, speed: 2}]", "must be of the form of conf/recipe/lf3x3.yaml"),
         ("[]", "recipe r must have stages"),
+        ("[{name: a, hours: '2'}]", "hours of stage a of recipe r must be a number, got '2'"),
+        ("[{name: a, hours: true}]", "hours of stage a of recipe r must be a number, got True"),
+        ("[{name: a, hours: 1, seed: 0.5}]", "seed of stage a .* must be a whole number, got 0.5"),
+        ("[{name: a, hours: 1, overrides: x=1}]", "overrides of stage a .* a list of texts, got"),
+        ("[{name: a, hours: 1, start: [b]}]", "start of stage a of recipe r must be text, got"),
+        ("[{name: a, hours: 1}, {name: b, mean: {a: x}}]", "mean of stage b .* with numbers, got"),
+        ("[{name: a, hours: 2}, {name: b, hours: 2}]", "hours of stage b .* above the 2 of what"),
+        ("[{name: a, hours: 2}, {name: b, mean: {a: 1}}, {name: c, hours: 1}]", "above the 2 of"),
+        ("[{name: a, hours: 1]", "r.yaml must be of the form of conf/recipe/lf3x3.yaml"),
+        ("[{name: a, hours: 1}]\noverrides: x=1", "overrides of recipe r must be a list of texts"),
+        ("[{name: a, hours: 1}]\nafter: lf3x3", "after of recipe r must be a list of texts, got"),
+        ("[{name: a, hours: 1}]\noverrides: null", "overrides of recipe r must be a list of"),
     ],
 )
 def test_a_wrong_recipe_is_named(stages, said, tmp_path):
@@ -229,11 +287,52 @@ def test_a_wrong_recipe_is_named(stages, said, tmp_path):
         ([], "recipe must be one or more of clean/e2vid_plus, .*, got none"),
         (["lf4x4"], "recipe must be one of .*, got lf4x4"),
         (["lf3x3", "nice=25"], r"nice must be a whole number in 0\.\.19, got 25"),
+        (["lf3x3", f"clone={ROOT / 'docs'}"], "clone must be a new folder or a clone of this"),
+        (["lf3x3", "clone=/dev/null/x"], "clone must be a folder to make, got /dev/null/x: fatal"),
+        (["clean/etnet", "scene.rot=x"], "stage training of recipe clean/etnet: .*rot"),
     ],
 )
-def test_a_wrong_command_line_is_named(words, said):
+def test_a_wrong_command_line_is_named(words, said, monkeypatch):
+    monkeypatch.setattr(campaign, "git_commit", lambda: "abc")
     with pytest.raises(ValueError, match=said):
         campaign.run(words)
+
+
+def test_an_experiment_that_is_none_is_named_before_anything_is_started(tmp_path, monkeypatch):
+    monkeypatch.setattr(campaign, "git_commit", lambda: "abc")
+    (tmp_path / "r.yaml").write_text("experiment: nosuch\nstages: [{name: a, hours: 1}]\n")
+    with pytest.raises(ValueError, match="stage a of recipe r: .*nosuch"):
+        campaign.run([str(tmp_path / "r.yaml"), f"out={tmp_path / 'out'}"])
+    assert not (tmp_path / "out").exists()
+
+
+def test_hours_are_above_those_of_the_network_that_is_widened(tmp_path):
+    campaign.check_hours([read(name) for name in names()])
+    campaign.check_hours([read("setnet_large")])
+    medium, large = read("setnet_medium"), read("setnet_large")
+    longer = medium.stages[-2]._replace(hours=29)
+    medium = medium._replace(stages=[*medium.stages[:-2], longer, medium.stages[-1]])
+    said = "hours of stage distillation of recipe setnet_large must be above the 29 of"
+    with pytest.raises(ValueError, match=said):
+        campaign.check_hours([large, medium])
+
+
+def test_paths_are_those_of_the_folder_that_a_campaign_is_started_in(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for folder in ("photos", "more", "clone/scripts/campaign"):
+        (tmp_path / folder).mkdir(parents=True)
+    started = []
+    monkeypatch.setattr(os, "execv", lambda _, words: started.append(words[3:]))
+    monkeypatch.setattr(campaign, "names", lambda: ["lf3x3"])
+    words = ["tiny.yaml", "lf3x3", "clone=clone", "out=here", "scene.root=photos"]
+    words += ["scene.extra_train_root=[photos,more]", "teachers=[lf3x3,single256]", "width=8"]
+    (tmp_path / "tiny.yaml").write_text("experiment: lf3x3\nstages: [{name: a, hours: 1}]\n")
+    campaign.run([*words, "status"])
+    assert started == [[
+        f"{tmp_path}/tiny.yaml", "lf3x3", f"out={tmp_path}/here", f"scene.root={tmp_path}/photos",
+        f"scene.extra_train_root=[{tmp_path}/photos,{tmp_path}/more]",
+        "teachers=[lf3x3,single256]", "width=8", "status",
+    ]]  # fmt: skip
 
 
 def test_a_campaign_runs_at_a_commit(monkeypatch, tmp_path):
@@ -262,7 +361,8 @@ def test_a_mean_of_weights_is_weighted(tmp_path):
 
 @pytest.mark.parametrize("name", ["lf3x3", "clean/etnet"])
 def test_weights_are_shipped_to_where_the_recipe_looks_for_them(name, tmp_path, monkeypatch):
-    work, words = RecipeWork(read(name), Settings(tmp_path)), []
+    given = ["+scene.root=/data/photos", "width=8"]
+    work, words = RecipeWork(read(name), Settings(tmp_path, overrides=given)), []
     monkeypatch.setattr("scripts.campaign.work.run", lambda module, *given: words.extend(given))
     for stage in work.recipe.stages:
         path = work.folder / f"{stage.name}.safetensors"
@@ -271,6 +371,7 @@ def test_weights_are_shipped_to_where_the_recipe_looks_for_them(name, tmp_path, 
     work._ship(work.recipe.stages[-1])
     options = dict(zip(words[1::2], words[2::2], strict=True))
     assert Path(options["--to"]) / f"{options['--name']}.safetensors" == work.shipped
+    assert options["--recipe"] == f"{name}, width=8"
 
 
 def test_a_training_gives_way_to_other_sessions(tmp_path):
@@ -292,11 +393,14 @@ def until(seen) -> None:
 
 
 def test_the_command_of_a_training_is_one_of_src_train(tmp_path):
-    work = RecipeWork(read("lf3x3", ["scene.root=x"]), Settings(tmp_path))
+    given = ("scene.root=x", "seed=7", "loss.l1.weight=2")
+    work = RecipeWork(read("lf3x3"), Settings(tmp_path, overrides=given))
+    assert work._overrides(work.recipe.stages[-1])[-3:] == list(given), "above those of a stage"
     stage = work.recipe.stages[0]
     words = work.trainings[stage.name].command(work._overrides(stage), None)
     assert "campaign-child" in " ".join(words) and "experiment=lf3x3" in words
     assert "scene.root=x" in words
+    assert "trainer.enable_progress_bar=false" in words, "no bar, not Lightning's own either"
     assert words[:3] == ["nice", "-n", "19"] and os.access(words[3], os.X_OK)
 
 
@@ -344,7 +448,7 @@ TINY = [
 @pytest.mark.parametrize("name", names())
 def test_each_recipe_runs_from_nothing_to_its_card(name, tmp_path, monkeypatch):
     commit_of(tmp_path / "repository", monkeypatch)
-    full = read(name, TINY)
+    full = read(name)
     own = [o for o in full.overrides if not o.startswith(("scene.", "sensor.", "~sensor"))]
     widened = full.stages[0].widen
     begun = files.read_card(files.WEIGHTS / f"{widened}.safetensors")["hours"] if widened else 0
@@ -355,7 +459,9 @@ def test_each_recipe_runs_from_nothing_to_its_card(name, tmp_path, monkeypatch):
         )
         for place, stage in enumerate(full.stages)
     ]
-    work = RecipeWork(full._replace(overrides=own, stages=stages), Settings(tmp_path / "out"))
+    work = RecipeWork(
+        full._replace(overrides=own, stages=stages), Settings(tmp_path / "out", overrides=TINY)
+    )
     monkeypatch.setattr(driver, "POLL_S", 0.5)
     assert run([work]) == 0, (work.folder / full.stages[0].name / "log.txt").read_text()
     assert work.state() == "done" and files.load(work.shipped).eval()

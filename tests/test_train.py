@@ -3,17 +3,19 @@
 import json
 import time
 from pathlib import Path
+from unittest.mock import Mock, call
 
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
+from lightning.pytorch.callbacks import ModelCheckpoint
 from omegaconf import DictConfig
 
 from src.app import entry_point
 from src.eval import evaluate
 from src.recordings.files.recording import read_events
 from src.simulate import simulate
-from src.train import train
+from src.train import fit, train
 from tests.conftest import ROOT
 
 TINY = ["debug=fdr", "~callbacks.progress", "loss=l1", "metrics.lpips=null"]
@@ -157,6 +159,21 @@ def test_a_training_that_takes_no_step_is_refused(tmp_path):
     with pytest.raises(ValueError, match="limit_train_batches and train_hours must let"):
         train(cfg)
     assert not (tmp_path / "results.json").exists()
+
+
+@pytest.mark.parametrize("is_there", [True, False])
+def test_several_processes_store_in_the_folder_of_the_first_and_all_or_none(is_there, tmp_path):
+    """As under torchrun, which gives each process a folder of its own."""
+
+    def train_in_the_folder_of_the_first(*_, **__) -> None:
+        trainer.checkpoint_callback.dirpath = str(tmp_path / "first")
+
+    trainer = Mock(checkpoint_callback=Mock(spec=ModelCheckpoint, dirpath=str(tmp_path / "own")))
+    trainer.fit.side_effect = train_in_the_folder_of_the_first
+    trainer.strategy.broadcast.side_effect = lambda _: not is_there  # what the first says
+    fit(trainer, Mock(steps_so_far=1), Mock(), None)
+    stored = [] if is_there else [call(tmp_path / "first" / "last.ckpt")]
+    assert trainer.save_checkpoint.call_args_list == stored
 
 
 @pytest.mark.parametrize("turbulence", ["none", "strong"])

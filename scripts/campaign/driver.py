@@ -12,7 +12,7 @@ POLL_S, PATIENCE_S = 5.0, 120.0  # between two looks; for a training to store it
 
 
 def run(settings: Settings, recipes: list[RecipeWork]) -> int:
-    """Train until all is done; return 1 if a training has failed.
+    """Train until all is done, also what failed before; return 1 if a training has failed.
 
     Raises ValueError when another campaign works in the same folder.
     """
@@ -23,6 +23,8 @@ def run(settings: Settings, recipes: list[RecipeWork]) -> int:
         except BlockingIOError as error:
             reason = f"out must be a folder that no campaign works in, got {settings.out}"
             raise ValueError(reason) from error
+        for work in recipes:
+            work.try_again()
         with stop_by_signals():
             try:
                 while _turn(settings, recipes):
@@ -51,7 +53,7 @@ def _turn(settings: Settings, recipes: list[RecipeWork]) -> bool:
             if work.advance():
                 work.start()
                 states[place] = "running"
-                print(f"{time.strftime('%F %T')} {work.line().split(',')[0]}", flush=True)
+                print(f"{time.strftime('%F %T')} {work.line()}", flush=True)
     waiting = [work for work, state in zip(recipes, states, strict=True) if state == "waiting"]
     stuck = [work for work in waiting if not is_ready(work)]
     if stuck and "running" not in states and len(waiting) == len(stuck):

@@ -21,12 +21,14 @@ from src.models import files
 # In the command lines of a training and of what it starts: filters of warnings are handed on, and
 # no warning begins with this word.
 MARK = "ignore:campaign-child"
+WRONG_VALUE = 2  # exit code of a training that would end so again
 
 
 class Settings(NamedTuple):
     """What all trainings of a campaign share: threads and priority (19: lowest) of each.
 
     `max_failures`: in a row, without a new checkpoint, after which a training is given up.
+    `overrides`: of src.train, above those of a recipe and its stages.
     """
 
     out: Path = Path("out/campaign")
@@ -34,6 +36,7 @@ class Settings(NamedTuple):
     threads: int = 1
     nice: int = 19
     max_failures: int = 3
+    overrides: Sequence[str] = ()
 
 
 class Training:
@@ -45,6 +48,7 @@ class Training:
     def __init__(self, settings: Settings, folder: Path, hours: float):
         self.settings, self.folder, self.hours = settings, folder, hours
         self.weights = folder.with_suffix(".safetensors")
+        self.log, self.failed = folder / "log.txt", folder / "failed.txt"
         self.failures, self.began = 0, 0.0
         self.process: subprocess.Popen | None = None
 
@@ -59,7 +63,8 @@ class Training:
         return [
             "nice", "-n", str(self.settings.nice), sys.executable, "-W", MARK, "-m", "src.train",
             *overrides, f"train_hours={self.hours}", f"export={self.weights}",
-            f"hydra.run.dir={self.folder / f'part{number:03}'}", "~callbacks.progress",
+            f"hydra.run.dir={self.folder / f'part{number:03}'}",
+            "trainer.enable_progress_bar=false",
             *([f"ckpt={start}"] if start else []),
         ]  # fmt: skip
 
@@ -68,9 +73,9 @@ class Training:
         self.folder.mkdir(parents=True, exist_ok=True)
         self._remove_old_checkpoints()
         lock = os.open(self.folder / "lock", os.O_RDWR | os.O_CREAT)
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(lock, fcntl.LOCK_EX)  # `status` looks at it for a moment
         environment = os.environ | {"OMP_NUM_THREADS": str(self.settings.threads)}
-        with (self.folder / "log.txt").open("a") as log:
+        with self.log.open("a") as log:
             command, self.began = self.command(overrides, start), time.time()
             self.process = subprocess.Popen(
                 command, cwd=ROOT, env=environment, stdin=subprocess.DEVNULL, stdout=log,
@@ -89,7 +94,7 @@ class Training:
             return False
         with (self.folder / "lock").open("a") as lock:
             try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
             except BlockingIOError:
                 return True
         if self.process is not None:
@@ -108,18 +113,23 @@ class Training:
             return "running"
         if self._done():
             return "done"
-        return "failed" if (self.folder / "failed.txt").is_file() else "waiting"
+        return "failed" if self.failed.is_file() else "waiting"
 
     def settle(self) -> None:
-        """Note how a part that this has started ended; too many failures end a training."""
+        """Note how a part that this has started ended; too many failures, or a wrong value, end a
+        training."""
         if self.process is None or self.process.poll() is None:
             return
         code, self.process = self.process.returncode, None
         moved = any(path.stat().st_mtime > self.began for path in self.folder.rglob("*.ckpt"))
         self.failures = 0 if moved or code == 0 else self.failures + 1
-        if self.failures >= self.settings.max_failures:
-            last = (self.folder / "log.txt").read_text(errors="replace").splitlines()[-1:]
-            (self.folder / "failed.txt").write_text(f"exit code {code}: {' '.join(last)}\n")
+        if self.failures >= self.settings.max_failures or code == WRONG_VALUE:
+            last = self.log.read_text(errors="replace").splitlines()[-1:]
+            self.failed.write_text(f"exit code {code}: {' '.join(last)}\n")
+
+    def reason(self) -> str:
+        """Return why this training has failed and where its log is."""
+        return f"{self.failed.read_text().strip()}; log: {self.log}"
 
     def progress(self) -> str:
         """Return hours, steps and the last scores of the learning curve, in one line."""
@@ -151,7 +161,9 @@ class Training:
         return files.read_card(self.weights) if self.weights.is_file() else {}
 
     def _done(self) -> bool:
-        """Return whether a part has its results, or weights, of the hours asked for now."""
+        """Return whether there are weights, with results or a card of the hours asked for now."""
+        if not self.weights.is_file():
+            return False
         for results in self.folder.glob("part*/results.json"):
             config = OmegaConf.load(results.with_name("config.yaml"))
             if config.train_hours >= self.hours:

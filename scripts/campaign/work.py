@@ -1,5 +1,6 @@
 """A recipe at work: which stage is next, what it starts from, what it leaves behind."""
 
+import re
 import subprocess
 import sys
 from collections.abc import Collection
@@ -9,6 +10,8 @@ import torch
 
 from scripts.campaign.recipe import ROOT, Recipe, Stage
 from scripts.campaign.training import Settings, Training
+from src.app.compose import compose_checked_config
+from src.app.path_overrides import is_path_key
 from src.models import files
 
 
@@ -66,7 +69,22 @@ class RecipeWork:
         state, stage = self.state(), self._stage()
         training = self.trainings.get(stage.name)
         progress = f", {training.progress()}" if training else ""
-        return f"{self.name}: {state}, {stage.name}{progress}"
+        reason = f"; {training.reason()}" if training and state == "failed" else ""
+        return f"{self.name}: {state}, {stage.name}{progress}{reason}"
+
+    def check_stages(self) -> None:
+        """Raise ValueError, naming the stage, for overrides that make no config."""
+        for stage in self.recipe.stages:
+            words = [re.sub(r"[{}]", "", word) for word in self._overrides(stage)]
+            try:
+                compose_checked_config("train", [], words)
+            except ValueError as error:
+                raise ValueError(f"stage {stage.name} of recipe {self.name}: {error}") from error
+
+    def try_again(self) -> None:
+        """Forget that trainings have failed."""
+        for training in self.trainings.values():
+            training.failed.unlink(missing_ok=True)
 
     def _stage(self) -> Stage:
         """Return the first stage that is not done, or the last."""
@@ -92,7 +110,7 @@ class RecipeWork:
         known = {*self.recipe.after, *(one.name for one in self.recipe.stages)}
         paths = {name: path for name in known if (path := self._network(name))}
         common = [f"experiment={self.recipe.experiment}", *self.recipe.overrides]
-        given = [*common, f"seed={stage.seed}", *stage.overrides]
+        given = [*common, f"seed={stage.seed}", *stage.overrides, *self.settings.overrides]
         for name, path in paths.items():
             given = [word.replace(f"{{{name}}}", path) for word in given]
         return given
@@ -114,8 +132,8 @@ class RecipeWork:
         if source is None:
             raise ValueError(f"widen of stage {stage.name} must be a network, got {stage.widen}")
         self.folder.mkdir(parents=True, exist_ok=True)
-        words = [f"experiment={self.recipe.experiment}", f"seed={stage.seed}", *stage.overrides]
-        run("scripts.widen_setnet", *words, f"ckpt={source}", f"export={self._weights(stage.name)}")
+        files_of = f"ckpt={source}", f"export={self._weights(stage.name)}"
+        run("scripts.widen_setnet", *self._overrides(stage), *files_of)
 
     def _average(self, stage: Stage) -> None:
         shares = {self._weights(name): share for name, share in (stage.mean or {}).items()}
@@ -124,9 +142,12 @@ class RecipeWork:
     def _ship(self, stage: Stage) -> None:
         """Write the last stage's weights with card and learning curve to `shipped`."""
         last = [name for name in self.trainings if self._weights(name).is_file()][-1]
+        given = ((word.split("=")[0].lstrip("+"), word) for word in self.settings.overrides)
+        more = " ".join(word for key, word in given if not is_path_key(key, "train"))
+        recipe = f"{self.name}, {more}" if more else self.name
         run(
             "scripts.ship_weights", str(self.folder / last), "--name", self.name, "--recipe",
-            self.name, "--weights", str(self._weights(stage.name)), "--to",
+            recipe, "--weights", str(self._weights(stage.name)), "--to",
             str(self.settings.out / "weights"),
         )  # fmt: skip
 

@@ -75,6 +75,11 @@ class LearningCurve(Callback):
         if is_due or trainer.should_stop or trainer.global_step == trainer.max_steps:
             self.score_and_export(trainer, pl_module)
 
+    def on_fit_end(self, trainer: Trainer, pl_module: Any) -> None:
+        """Export where nothing was left to train."""
+        if self.rows and self.export and trainer.is_global_zero and not self.export.is_file():
+            self.export_weights(pl_module)
+
     def on_exception(self, trainer: Trainer, pl_module: Any, exception: BaseException) -> None:
         if self.rows and trainer.is_global_zero:
             self.export_weights(pl_module)
@@ -153,6 +158,15 @@ def read_training_progress(weights: Path) -> dict:
         allowed = "a checkpoint or weights with a learning curve"
         raise ValueError(f"ckpt must be {allowed}, got {weights}; start= begins from any weights")
     return card
+
+
+def check_hours_left(train_hours: float | None, weights: Path) -> None:
+    """Raise ValueError where a training of `train_hours` (None: no limit) that goes on from the
+    file `weights` has no time left, and as `read_training_progress` does."""
+    hours = read_training_progress(weights)["hours"]
+    if train_hours is not None and train_hours <= hours:
+        allowed = f"> {hours:g}, the hours of ckpt={weights}"
+        raise ValueError(f"train_hours must be {allowed}, got {train_hours:g}")
 
 
 def continue_from_weights(

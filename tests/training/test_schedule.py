@@ -128,6 +128,21 @@ def test_exported_weights_go_on_where_no_checkpoint_is_left(three_hours, tmp_pat
     assert rate(second) == pytest.approx(1e-3 * CosineSchedule(6.0).lr_ratio(5.0) * 3 / 5)
 
 
+def test_weights_that_have_the_hours_already_are_refused(three_hours, tmp_path):
+    now = three_hours / "now/net.safetensors"
+    with pytest.raises(ValueError, match=r"train_hours must be > 3, the hours of ckpt=.*, got 3$"):
+        run(tmp_path / "a", "train_hours=3", f"ckpt={now}")
+    assert not (tmp_path / "a" / "results.json").exists()
+
+
+def test_a_training_with_nothing_left_to_do_leaves_weights(three_hours, tmp_path):
+    now, before = tmp_path / "net.safetensors", three_hours / "now/net.safetensors"
+    same = ["train_hours=3", f"ckpt={three_hours / 'checkpoints'}"]
+    run(tmp_path / "a", *same, f"export={now}")
+    assert files.read_card(now) == files.read_card(before)
+    assert torch.equal(files.load(now).head.weight, files.load(before).head.weight)
+
+
 def test_nine_views_go_on_from_one_with_its_hours(tmp_path):
     now = tmp_path / "now.safetensors"
     run(tmp_path / "one", "train_hours=3", "experiment=single256", f"export={now}")
