@@ -105,13 +105,13 @@ def store_clips(
     until: float | None = None,
 ) -> FillReport:
     """Store the next `count` of `clips` (None: all), until the time `until` of time.monotonic; a
-    clip that is ready later is dropped.
+    clip that is ready later is dropped, but for the first.
     """
     start, waited, stored = time.monotonic(), clips.waiting_s, 0
     while count is None or stored < count:
         if (clip := next(clips, None)) is None:
             break
-        if until is not None and time.monotonic() >= until:
+        if stored and until is not None and time.monotonic() >= until:
             break
         store(*clip)
         stored += 1

@@ -13,7 +13,9 @@ from omegaconf import OmegaConf
 
 from scripts.lease import __main__ as lease
 from scripts.lease import plan as plans
+from scripts.lease.folder import gather_files
 from scripts.lease.plan import Network
+from scripts.lease.run import Lease
 from scripts.lease.selection import (
     SizedNetwork,
     allot_seconds,
@@ -119,6 +121,15 @@ def test_a_file_that_is_no_plan_is_refused(changes, said, tmp_path):
         plans.load_plan(plan(tmp_path, **changes))
 
 
+@pytest.mark.parametrize("text", ["networks: [", "- a", "fill: \t- 1"])
+def test_yaml_that_is_none_is_refused_in_one_line(text, tmp_path):
+    path = tmp_path / "plan.yaml"
+    path.write_text(text)
+    for read in (plans.load_plan, lambda file: gather_files(tmp_path / "all", file, {}, 1)):
+        with pytest.raises(ValueError, match="plan.yaml must be as conf/lease/default.yaml is"):
+            read(path)
+
+
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
@@ -134,6 +145,26 @@ def test_a_network_that_cannot_be_trained_is_refused(changes, said, tmp_path):
     with pytest.raises(ValueError, match=said):
         found = plans.load_plan(plan(tmp_path, **changes))
         [size_network(found, network) for network in found.networks]
+
+
+@pytest.mark.parametrize(
+    ("ended", "code", "said"),
+    [
+        (["a", "b", "c"], 0, "trained: a, b, c; in out"),
+        (["a", "b"], 0, "trained: a, b, c; in out"),
+        (["a", "c"], 1, "trained: a, b, c; unfinished: b; in out"),
+    ],
+)
+def test_the_exit_code_tells_whether_what_is_not_optional_was_trained(ended, code, said):
+    networks = [SimpleNamespace(name=name, network=Network(name, minutes=1)) for name in "abc"]
+    networks[2].network.optional = True
+    lines: list[str] = []
+    lease = SimpleNamespace(
+        selection=SimpleNamespace(networks=networks), log=lines.append,
+        exports=SimpleNamespace(out="out"),
+        networks={name: {"trained": 3, "finished": name in ended} for name in "abc"},
+    )  # fmt: skip
+    assert Lease._exit_code(lease) == code and lines == [said]
 
 
 def test_a_damaged_pack_is_refused(tmp_path):

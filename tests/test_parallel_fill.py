@@ -143,6 +143,12 @@ def test_it_stops_in_time_without_a_gap(imported, monkeypatch):
     assert str(report).startswith("3 clips in ") and f"{report.clips_per_second:.1f}" in str(report)
 
 
+def test_a_first_clip_that_comes_late_is_kept(imported):
+    stored: dict[int, CachedClip] = {}
+    report = fill(source(), range(9), stored.__setitem__, device="cpu", workers=0, until=0)
+    assert list(stored) == [0] and report.clips == 1
+
+
 def test_nothing_to_do_and_no_one_to_do_it():
     assert made(source(), [])[1].clips == 0
     with pytest.raises(ValueError, match="workers must be a whole number >= 0, got -1"):

@@ -9,8 +9,9 @@ One process checks the device, fills a pre-simulated turbulence cache in its mem
 networks of PLAN, a file as conf/lease/default.yaml, in turn, each by wall time with the rate
 brought to its end; it may be killed at any time, and what is in `out` is usable.  `join` makes of
 that what `ckpt=` of src.train and `start` of a plan continue from.  `folder` gathers what a lease
-needs, 60 MiB at most.  Minutes count from the start of the process; exit code 0: something was
-trained, 1: nothing was, 2: the plan does not fit or is none.
+needs, 60 MiB at most.  Minutes count from the start of the process; exit code 0: all networks that
+are not optional were trained to their end, 1: one was not, or nothing was, 2: the plan does not fit
+or is none.
 """
 
 import argparse

@@ -21,7 +21,7 @@ def fill_caches(
     `trial` leaves; samples are then of the clips that are there.  Returns clips and clips a second
     of each.
 
-    Raises ValueError where one stays empty.
+    Raises ValueError where the memory holds no clip of one.
     """
     free = free_memory(device.kind)
     room = free - MEMORY_FACTOR * trial.memory - UNUSED_GIB * GIB if trial.memory else free / 2
@@ -42,10 +42,11 @@ def fill_caches(
 def _fill_cache(
     cache: DeviceClipCache, plan: Fill, device: str, seconds: float, log: Callable
 ) -> dict[str, float]:
-    """Fill `cache` for `seconds`; those who draw go on to renew it while it is trained on.
+    """Fill `cache` for `seconds`, with one clip at least; those who draw go on to renew it while it
+    is trained on.
 
-    Where the processes that draw made no clip in this time (their imports may take longer) or died,
-    this one draws for as long again, and nothing is renewed.
+    Where the processes that draw died before the first clip, this one draws for `seconds`, and
+    nothing is renewed.
     """
     most = max(1, min(MAX_WORKERS, (os.cpu_count() or 1) - 1))
     workers = most if plan.workers is None else plan.workers
@@ -71,8 +72,6 @@ def _fill_cache(
     if workers and not report.clips:
         log(f"cache: no clip by {workers} processes in {seconds:.0f} s; this one draws now")
         report = fill_with(0)
-    if not report.clips:
-        raise ValueError(f"fill: minutes must be > {plan.minutes:g}: no clip was made")
     cache.clips = report.clips
     few = f"; less than fill: warn_below_clips = {plan.warn_below_clips}"
     log(f"cache: {report}{few * (report.clips < plan.warn_below_clips)}")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from omegaconf import OmegaConf
 
-from scripts.lease.plan import MIB, Plan, load_plan, start_path
+from scripts.lease.plan import MIB, Plan, load_plan, read_content, start_path
 from scripts.lease.selection import Selection, allot_seconds, overhead_s
 from src.metrics.lpips import BACKBONE_FOLDER
 from src.models import files
@@ -18,7 +18,7 @@ def gather_files(folder: Path, plan: Path, given: Mapping[str, Path], max_mib: f
 
     Raises ValueError where a file is missing or damaged, or they are more than `max_mib` together.
     """
-    content = OmegaConf.load(plan)
+    content = read_content(plan)
     names: dict[Path, str] = {}
     for key in ("scenes", "lpips"):
         if content.get(key) is None and key not in given:

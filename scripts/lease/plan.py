@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import yaml
 from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -154,19 +155,30 @@ def start_path(folder: Path, start: str) -> Path:
     return path if path.is_file() else files.locate(start)
 
 
+def read_content(path: Path) -> DictConfig:
+    """Return the keys of a YAML file; raises ValueError for a file that has none."""
+    try:
+        content = OmegaConf.load(path)
+    except (OSError, OmegaConfBaseException, yaml.YAMLError) as error:
+        raise ValueError(f"{path} must be as conf/lease/default.yaml is: {error}") from error
+    if not isinstance(content, DictConfig):
+        raise ValueError(f"{path} must be as conf/lease/default.yaml is, got a list")
+    return content
+
+
 def load_plan(path: Path) -> Plan:
     """Return the plan of a YAML file.
 
     Raises ValueError naming the key for what is no plan, or names a file that is missing or
     damaged.
     """
+    given = read_content(path)
     try:
-        given = OmegaConf.load(path)
         refuse_renamed_keys(OmegaConf.create({"lease": given}))
         content = OmegaConf.merge(OmegaConf.structured(Plan), given)
         content.folder = path.resolve().parent
         plan = OmegaConf.to_object(content)
-    except (OSError, OmegaConfBaseException, TypeError) as error:
+    except (OmegaConfBaseException, TypeError) as error:
         raise ValueError(f"{path} must be as conf/lease/default.yaml is: {error}") from error
     assert isinstance(plan, Plan)
     for key, name in (("scenes", plan.scenes), ("lpips", plan.lpips)):

@@ -54,7 +54,8 @@ class Lease:
         self.exporting = threading.Lock()
 
     def run(self) -> int:
-        """Do it all; return the exit code: 0 where something was trained."""
+        """Do it all; return the exit code: 0 where all networks that are not optional were trained
+        to their end."""
         threading.Thread(target=self._end_in_time, daemon=True).start()
         for name, reason in self.selection.left_out.items():
             self.log(f"{name} is left out: {reason}")
@@ -120,6 +121,7 @@ class Lease:
         self._train(one, now + seconds)
         row = self.rows[one.name][-1]
         scores = ", ".join(f"{name} {row[name]:.4g}" for name in NAMES if name in row)
+        self.networks[one.name]["finished"] = True
         self.log(f"{one.name} is trained: {scores}")
 
     def _train(self, one: SizedNetwork, until: float) -> None:
@@ -178,8 +180,11 @@ class Lease:
 
     def _exit_code(self) -> int:
         trained = [name for name, facts in self.networks.items() if facts.get("trained")]
-        self.log(f"trained: {', '.join(trained) or 'nothing'}; in {self.exports.out}")
-        return 0 if trained else 1
+        required = [one.name for one in self.selection.networks if not one.network.optional]
+        missing = [name for name in required if not self.networks[name].get("finished")]
+        unfinished = f"; unfinished: {', '.join(missing)}" if missing else ""
+        self.log(f"trained: {', '.join(trained) or 'nothing'}{unfinished}; in {self.exports.out}")
+        return 1 if missing or not trained else 0
 
     def _end_in_time(self) -> None:
         """End the process at the end of the lease, whatever holds it up then."""
