@@ -51,13 +51,22 @@ def draw_curves(path: Path, curves: Mapping[str, Curve]) -> Path:
     return save_figure(figure, path)
 
 
+def name_folders(folders: Sequence[Path]) -> list[str]:
+    """Return the end of each path, as short as makes all of them differ."""
+    paths = [folder.resolve() for folder in folders]
+    most = max(len(path.parts) for path in paths)
+    ends = ([str(Path(*path.parts[-n:])) for path in paths] for n in range(1, most + 1))
+    return next(names for names in ends if len(set(names)) == len(set(paths)))
+
+
 def main() -> None:
     """Read the arguments."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folders", type=Path, nargs="+")
     parser.add_argument("--out", type=Path, default=Path("out/learning.png"))
     given = parser.parse_args()
-    print(draw_curves(given.out, {folder.name: read_curve(folder) for folder in given.folders}))
+    curves = zip(name_folders(given.folders), map(read_curve, given.folders), strict=True)
+    print(draw_curves(given.out, dict(curves)))
 
 
 if __name__ == "__main__":

@@ -2,9 +2,10 @@
 
 Writes `weights/NAME.safetensors` (float16, spectral norm folded), its model card `NAME.md` and, of
 a run with a learning curve, that as a figure.  RUN: a folder of src.train, or of a stage of a
-campaign.  Each DIR is one of src.eval with these weights; where RUN is a name of weights/, only its
-card is written, with the scores in the DIRs.  A campaign gives --recipe, the --weights of the last
-stage where they are not those of RUN, and a folder --to write to instead of weights/.
+campaign.  A name that is there already is refused without --replace.  Each DIR is one of src.eval
+with these weights; where RUN is a name of weights/, only its card is written, with the scores in
+the DIRs.  A campaign gives --recipe, the --weights of the last stage where they are not those of
+RUN, and a folder --to write to instead of weights/.
 """
 
 import argparse
@@ -21,8 +22,10 @@ from src.metrics.table import METRICS, Column
 from src.models import files
 from src.models.network import FramePostprocessor
 from src.records import results
+from src.records.atomic import atomic_path, write_text
 from src.training.learning_curve import TRAINING_STATE
 
+ROOT = Path(__file__).resolve().parents[1]
 LARGEST = 16 * 2**20  # bytes of a file
 CARD_NOTE = "Mean over clips (95 % bootstrap CI)."
 CURVE = "The curve jumps where a stage has other validation clips."
@@ -34,20 +37,26 @@ Simulated turbulence and sensor only, grey pictures, scenes in planar motion.
 
 class Given(NamedTuple):
     """What a campaign says of a network: its recipe, other weights than those of the run, and the
-    folder to write to."""
+    folder to write to; `replace`: weights of this name may be there already."""
 
     recipe: str | None = None
     weights: Path | None = None
     folder: Path | None = None  # None: weights/
+    replace: bool = False
 
 
 def ship(run: Path, name: str, tests: list[Path], given: Given | None = None) -> Path:
     """Write the weights of `run`, or those given, and their card; return the path of the weights.
 
-    Raises ValueError for a run without a whole checkpoint, of a working tree that is no commit, and
-    for weights above 16 MiB.
+    Raises ValueError for a run without a whole checkpoint, of a working tree that is no commit, for
+    weights above 16 MiB, and for weights of this name unless `given.replace`; all that is there
+    then stays.
     """
-    given, ckpt = given or Given(), files.newest_checkpoint(run)
+    given = given or Given()
+    path = (given.folder or files.WEIGHTS) / f"{name}.safetensors"
+    if path.exists() and not given.replace:
+        raise ValueError(f"--name must be a new one, got {name}, which {path} has; or --replace")
+    ckpt = files.newest_checkpoint(run)
     content = torch.load(ckpt, map_location="cpu", weights_only=True)
     card = facts(ckpt.parent.parent, content, first_config(run)) | going_on(content)
     if card["commit"].endswith("-dirty"):
@@ -57,32 +66,32 @@ def ship(run: Path, name: str, tests: list[Path], given: Given | None = None) ->
         card = {"recipe": given.recipe} | card
     if given.weights and (shares := files.read_card(given.weights).get("mean_of")):
         card = {"mean_of": shares} | card
-    path = (given.folder or files.WEIGHTS) / f"{name}.safetensors"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if rows := read_curve(run):
-        draw_curves(path.with_suffix(".png"), {name: rows})
-    files.save(path, network, content["network"], card)
-    if path.stat().st_size > LARGEST:
-        path.unlink()
-        raise ValueError(f"weights must have at most {LARGEST} bytes; {name} has more")
-    return _write_card(path, name, network, card, tests)
+    with atomic_path(path) as partial:  # the weights come last: with them all is there
+        files.save(partial, network, content["network"], card)
+        if (size := partial.stat().st_size) > LARGEST:
+            raise ValueError(f"weights must have at most {LARGEST} bytes, got {size} of {name}")
+        rows, figure = read_curve(run), path.with_suffix(".png")
+        if rows:
+            draw_curves(figure, {name: rows})
+        else:
+            figure.unlink(missing_ok=True)  # of another network
+        text = describe(name, network, card, _read_records(tests), bool(rows))
+        write_text(path.with_suffix(".md"), f"{text}\n{LIMITS}")
+    return path
 
 
 def rewrite_card(name: str, tests: list[Path]) -> Path:
     """Write the card of shipped weights anew, with what `tests` hold; its sections, written by
     hand, stay.  Returns the weights' path."""
     path = files.WEIGHTS / f"{name}.safetensors"
-    return _write_card(path, name, files.load(path), files.read_card(path), tests)
-
-
-def _write_card(
-    path: Path, name: str, network: torch.nn.Module, card: dict, tests: list[Path]
-) -> Path:
-    records = [json.loads((test / "results.json").read_text()) for test in tests]
     drawn, written = path.with_suffix(".png").is_file(), path.with_suffix(".md")
-    text = describe(name, network, card, records, drawn) + _read_sections(written)
-    written.write_text(text)
+    facts = name, files.load(path), files.read_card(path), _read_records(tests), drawn
+    write_text(written, describe(*facts) + _read_sections(written))
     return path
+
+
+def _read_records(tests: list[Path]) -> list[dict]:
+    return [json.loads((test / "results.json").read_text()) for test in tests]
 
 
 def _read_sections(card: Path) -> str:
@@ -196,7 +205,9 @@ def describe(
 def _fact(name: str, key: str, value: object) -> str:
     if key == "recipe":
         recipe, comma, rest = str(value).partition(",")
-        value = f"[{recipe}]({'../' * (name.count('/') + 1)}conf/recipe/{recipe}.yaml){comma}{rest}"
+        file = f"conf/recipe/{recipe}.yaml"
+        if (ROOT / file).is_file():  # not that of another folder
+            value = f"[{recipe}]({'../' * (name.count('/') + 1)}{file}){comma}{rest}"
     return f"| {key} | {value} |"
 
 
@@ -230,6 +241,7 @@ def main() -> None:
     parser.add_argument("--recipe", help="of conf/recipe, for the card")
     parser.add_argument("--weights", type=Path, help="to ship instead of those of the run")
     parser.add_argument("--to", type=Path, help="default: weights/")
+    parser.add_argument("--replace", action="store_true", help="weights of this name")
     parser.add_argument("--test", type=Path, nargs="*", default=[], help="folders of src.eval")
     arguments = parser.parse_args()
     shipped = files.WEIGHTS / f"{arguments.run}.safetensors"
@@ -237,7 +249,7 @@ def main() -> None:
         print(rewrite_card(str(arguments.run), arguments.test))
         return
     name = arguments.name or first_config(arguments.run).name
-    given = Given(arguments.recipe, arguments.weights, arguments.to)
+    given = Given(arguments.recipe, arguments.weights, arguments.to, arguments.replace)
     print(ship(arguments.run, name, arguments.test, given))
 
 

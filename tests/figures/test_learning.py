@@ -22,6 +22,19 @@ def test_the_newest_curve_is_drawn(tmp_path):
         assert picture.size[0] > picture.size[1]
 
 
+def test_folders_of_one_name_have_curves_of_their_own(tmp_path, monkeypatch):
+    folders = [tmp_path / name for name in ("a/run", "b/run", "b/other")]
+    for folder in folders:
+        folder.mkdir(parents=True)
+        (folder / "curve.csv").write_text("hours,lpips\n0,0.7\n")
+    drawn = []
+    monkeypatch.setattr(learning_curves, "draw_curves", lambda _, curves: drawn.append(curves))
+    monkeypatch.setattr("sys.argv", ["learning_curves", *map(str, folders)])
+    learning_curves.main()
+    assert list(drawn[0]) == ["a/run", "b/run", "b/other"] and all(drawn[0].values())
+    assert learning_curves.name_folders(folders[1:]) == ["run", "other"]
+
+
 def test_a_panel_has_its_unit(tmp_path, monkeypatch):
     drawn = []
     monkeypatch.setattr(learning_curves, "save_figure", lambda figure, _: drawn.append(figure))
