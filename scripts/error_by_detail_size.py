@@ -2,23 +2,27 @@
 
     python -m scripts.error_by_detail_size CKPT ... [--root PHOTOS]
 
-Of validation clips of nine views, 176 x 176, 40 windows, as networks were trained on
-(budget=hours); a picture counts after the best affine fit of its brightness, from window 10 on.  An
+Of validation clips of nine views, of which a network gets those it wants, 176 x 176, 40 windows, as
+networks were trained on (budget=hours); PHOTOS: a folder or a pack, without it the photographs in
+scikit-image.  A picture counts after the best affine fit of its brightness, from window 10 on.  An
 area that stays grey is missing at 16 pixels and more; LPIPS and SSIM hardly see it.
 """
 
 import argparse
+from pathlib import Path
 
 import torch
 from jaxtyping import Float
+from omegaconf import DictConfig
 from torch import Tensor
 from torch.nn import functional
 
-from src import models
 from src.app import simulation
 from src.app.compose import compose_config
+from src.app.methods import load_network_of_kind
 from src.app.script import run_script
 from src.metrics.image import align_brightness
+from src.models.network import VideoMethod
 from src.sim.pipeline import simulate
 
 SIDES = (2, 4, 8, 16, 44)  # of blocks, in pixels
@@ -46,27 +50,37 @@ def _scales(x: Tensor) -> list[Tensor]:
 
 
 @torch.no_grad()
+def measure(cfg: DictConfig, name: str) -> Float[Tensor, " scales"]:
+    """Return the mean of `missing` over the clips, of the network that `name` stands for.
+
+    Raises ValueError for what is no network for events and for photographs that are none.
+    """
+    network = load_network_of_kind(VideoMethod, cfg, name, "CKPT must be a network")
+    optics = simulation.select_optics(cfg, network)
+    try:
+        pipeline, rows = simulation.build_pipeline(cfg, "val", optics), []
+    except ValueError as error:
+        raise ValueError(str(error).replace("scene.root", "--root")) from error
+    for clip in range(CLIPS):
+        sample = simulate(pipeline, [clip])
+        frames = network.reconstruct_clip(sample)[0, WARMUP:]
+        rows.append(missing(frames, sample.target[0, WARMUP:]))
+    return torch.stack(rows).mean(0)
+
+
 def main() -> None:
     """Print a row of a Markdown table for each network."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("ckpts", nargs="+")
-    parser.add_argument("--root", default="../shared/data/photos")
+    parser.add_argument("ckpts", nargs="+", metavar="CKPT")
+    parser.add_argument("--root", type=Path, metavar="PHOTOS")
     given = parser.parse_args()
-    overrides = "budget=hours", f"scene.root={given.root}", f"data.test_crop={SIDE}"
-    pipeline = simulation.build_pipeline(
-        compose_config("train", "experiment=lf3x3", *overrides), "val"
-    )
-    networks, rows = [models.load(name) for name in given.ckpts], [[] for _ in given.ckpts]
-    for clip in range(CLIPS):
-        sample = simulate(pipeline, [clip])
-        for network, row in zip(networks, rows, strict=True):
-            frames = network.reconstruct_clip(sample)[0, WARMUP:]
-            row.append(missing(frames, sample.target[0, WARMUP:]))
+    cfg = compose_config("train", "experiment=lf3x3", "budget=hours", f"data.test_crop={SIDE}")
+    cfg.scene.root = str(given.root) if given.root else None
+    means = {name: measure(cfg, name) for name in given.ckpts}
     print("| pixels | " + " | ".join([f"< {side}" for side in SIDES] + [f"> {SIDES[-1]}"]) + " |")
     print("|---" * (len(SIDES) + 2) + "|")
-    for name, row in zip(given.ckpts, rows, strict=True):
-        means = torch.stack(row).mean(0)
-        print(f"| {name} | " + " | ".join(f"{value:.2f}" for value in means) + " |")
+    for name, row in means.items():
+        print(f"| {name} | " + " | ".join(f"{value:.2f}" for value in row) + " |")
 
 
 if __name__ == "__main__":

@@ -1,14 +1,15 @@
-"""Fit p2s.safetensors: python -m scripts.fit_p2s [steps, default 12000; 0: tables only].
+"""Fit p2s.safetensors: python -m scripts.fit_p2s [STEPS] [--out FILE]
 
 For each band of D/r0: exact PSFs of random Kolmogorov phase, a principal basis of them in the
 metric of a natural picture (power 1 / f^2), networks from the first modes of the phase to the
 weights of the whole PSF; then the tables of what each simplification costs
 (src/sim/turbulence/fidelity.py), for which 0 steps keep the networks there are.  Nothing but
-physics goes in.
+physics goes in.  FILE is written once, at the end; without it the simulator's own is replaced.
 """
 
 import argparse
 from dataclasses import dataclass
+from pathlib import Path
 
 import torch
 from safetensors.torch import load_file, save_file
@@ -23,7 +24,8 @@ from scripts.p2s_errors import (
 )
 from scripts.p2s_training import TrainableNetwork
 from src.app.script import run_script
-from src.sim.turbulence.p2s import EDGE_MARGIN, FILE, basis_parities
+from src.records.atomic import atomic_path, check_writable
+from src.sim.turbulence.p2s import EDGE_MARGIN, FILE, basis_parities, read_bands
 
 
 @dataclass(frozen=True)
@@ -49,12 +51,13 @@ PLANS = (
 )
 
 
-def fit_file(steps: int) -> None:
-    """Fit every band, measure what each simplification costs, and write the file."""
-    if steps:
-        save_file(fit_bands(steps), FILE)
-    networks = {name: t for name, t in load_file(FILE).items() if not name.startswith("errors.")}
-    save_file(networks | measure_error_tables(), FILE)
+def fit_file(steps: int, out: Path) -> None:
+    """Fit every band, measure what each simplification costs, and write the file `out`."""
+    fitted = fit_bands(steps) if steps else load_file(FILE)
+    networks = {name: t for name, t in fitted.items() if not name.startswith("errors.")}
+    tables = measure_error_tables(read_bands(networks))
+    with atomic_path(out) as partial:
+        save_file(networks | tables, partial)
 
 
 def fit_bands(steps: int) -> dict[str, Tensor]:
@@ -150,11 +153,15 @@ def train_network(
 def main() -> None:
     """Read the arguments."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("steps", type=int, nargs="?", default=12_000, help="0: tables only")
-    steps = parser.parse_args().steps
-    if steps < 0:
-        parser.error(f"steps must be >= 0, got {steps}")
-    fit_file(steps)
+    parser.add_argument(
+        "steps", type=int, nargs="?", default=12_000, help="default 12000; 0: tables only"
+    )
+    parser.add_argument("--out", type=Path, default=FILE, help="default: that of the simulator")
+    given = parser.parse_args()
+    if given.steps < 0:
+        parser.error(f"steps must be >= 0, got {given.steps}")
+    check_writable(given.out, "--out")
+    fit_file(given.steps, given.out)
 
 
 if __name__ == "__main__":

@@ -4,13 +4,14 @@ All in the metric of src/sim/turbulence/fidelity.py; part of `python -m scripts.
 """
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from scripts.exact_psf import fraunhofer_psf, noll_covariance
 from src.sim.turbulence.atmosphere import TILT_VARIANCE, Atmosphere
-from src.sim.turbulence.p2s import PSFBand, basis_parities, load_bands_by_d_over_r0
+from src.sim.turbulence.p2s import PSFBand, basis_parities
 from src.sim.turbulence.plane_waves import draw_plane_waves
 from src.sim.turbulence.psf import SAMPLES_PER_LAMBDA_OVER_D
 
@@ -43,15 +44,15 @@ def picture_metric(fine: int) -> Tensor:
     return correlation[lag[:, None, :, None], lag[None, :, None, :]].reshape(fine**2, fine**2)
 
 
-def measure_error_tables() -> dict[str, Tensor]:
-    """Return the tables: power and shares per strength and lambda / D in pixels."""
+def measure_error_tables(bands: Sequence[PSFBand]) -> dict[str, Tensor]:
+    """Return the tables of `bands`: power and shares per strength and lambda / D in pixels."""
     torch.manual_seed(0)
     rows = [_row(strength) for strength in STRENGTHS]
     tables = {name: torch.stack([row[name] for row in rows]) for name in rows[0]}
     axes = {"strength": STRENGTHS, "airy": AIRY, "modes_axis": MODES, "pitch_axis": PITCHES}
     tables |= {name: torch.tensor(values) for name, values in axes.items()}
     tables |= {"rank_axis": torch.tensor(RANKS), "kernel_axis": torch.tensor(REACHES)}
-    tables |= _networks()
+    tables |= _networks(bands)
     return {f"errors.{name}": value.float().contiguous() for name, value in tables.items()}
 
 
@@ -157,13 +158,13 @@ def _interpolated(nodes: Tensor, shares: Tensor) -> Tensor:
     return torch.einsum("ck,ck...->c...", shares, nodes.unflatten(0, (-1, 4)))
 
 
-def _networks() -> dict[str, Tensor]:
+def _networks(bands: Sequence[PSFBand]) -> dict[str, Tensor]:
     """Return what basis, networks and nodes far apart leave of the random power.
 
     Bands, strengths from where each band begins to its edge, networks, pitches (the first is 0),
     ranks, AIRY.
     """
-    edges = [band.max_d_over_r0 for band in load_bands_by_d_over_r0()]
+    edges = [band.max_d_over_r0 for band in bands]
     starts = [STRENGTHS[0], *edges[:-1]]
     axes = [
         [start * (edge / start) ** (step / (PLACES - 1)) for step in range(PLACES)]
@@ -171,7 +172,7 @@ def _networks() -> dict[str, Tensor]:
     ]
     rows = [
         torch.stack([_psf_errors(band, strength) for strength in axis])
-        for band, axis in zip(load_bands_by_d_over_r0(), axes, strict=True)
+        for band, axis in zip(bands, axes, strict=True)
     ]
     return {"psf": torch.stack(rows), "psf_strength": torch.tensor(axes)}
 

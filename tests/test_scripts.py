@@ -6,9 +6,19 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file
 
-from scripts import gallery, pretrain_context, readme, ship_weights, turbulence_map, widen_setnet
-from scripts.error_by_detail_size import missing
+from scripts import (
+    error_by_detail_size,
+    fit_p2s,
+    gallery,
+    pretrain_context,
+    readme,
+    ship_weights,
+    turbulence_map,
+    widen_setnet,
+)
+from scripts.error_by_detail_size import measure, missing
 from scripts.ship_weights import CARD_NOTE, Given, rewrite_card, ship
 from src.app import build
 from src.metrics.table import METRICS
@@ -71,6 +81,27 @@ def test_a_trained_run_is_shipped_whole_with_its_card(tmp_path, monkeypatch, cle
     anew = text.removesuffix(by_hand).splitlines()
     assert text.endswith(by_hand) and len(anew) == len(card.splitlines()) + 1
     assert set(anew) == set(card.splitlines())
+    refuse_what_is_there(run, path, monkeypatch)
+    (run / "curve.csv").unlink()
+    ship(run, "tiny/one", [run], Given(replace=True))
+    other = path.with_suffix(".md").read_text()
+    assert by_hand not in other and "![learning curve]" not in other
+    assert not path.with_suffix(".png").exists(), "the figure is of another network"
+    assert sorted(file.name for file in path.parent.glob("one*")) == ["one.md", "one.safetensors"]
+
+
+def refuse_what_is_there(run, path, monkeypatch):
+    """Neither a name that is taken nor weights too large change what is there."""
+    around = sorted(path.parent.iterdir())
+    before = [file.read_bytes() for file in around]
+    with pytest.raises(ValueError, match="--name must be a new one, got tiny/one, which .* has"):
+        ship(run, "tiny/one", [])
+    with monkeypatch.context() as patched:
+        patched.setattr(ship_weights, "LARGEST", 1000)
+        with pytest.raises(ValueError, match="weights must have at most 1000 bytes, got"):
+            ship(run, "tiny/one", [], Given(replace=True))
+    assert sorted(path.parent.iterdir()) == around
+    assert [file.read_bytes() for file in around] == before
 
 
 def test_weights_of_a_stage_are_shipped_with_the_card_of_a_run(tmp_path, monkeypatch, clean):
@@ -82,6 +113,9 @@ def test_weights_of_a_stage_are_shipped_with_the_card_of_a_run(tmp_path, monkeyp
         parameter.data *= 2
     other = tmp_path / "stage.safetensors"
     files.save(other, doubled, files.read_network_spec(first), {"mean_of": {"a": 0.5, "b": 0.5}})
+    elsewhere = Given("mine, width=8", folder=tmp_path)
+    text = ship(run, "own", [], elsewhere).with_suffix(".md").read_text()
+    assert "| recipe | mine, width=8 |" in text, "no link to a file that is not there"
     path = ship(run, "mean", [], Given("lf3x3", other, tmp_path / "weights"))
     for name, value in files.load(path).state_dict().items():
         assert torch.allclose(value, doubled.state_dict()[name], atol=2e-3), name
@@ -294,6 +328,33 @@ def test_what_is_missing_is_told_by_its_size():
         truth - grey.repeat_interleave(16, 2).repeat_interleave(16, 3), truth
     )
     assert areas > 0.5 and max(details) < 0.05
+
+
+def test_a_network_gets_the_views_that_it_wants_and_photographs_are_named(tmp_path, monkeypatch):
+    monkeypatch.setattr(error_by_detail_size, "CLIPS", 1)
+    small = ["data.test_windows=12", "data.test_crop=176", "turbulence=none"]
+    cfg = config("train", tmp_path, *small)
+    assert float(measure(cfg, "single256").min()) > 0
+    with pytest.raises(ValueError, match="CKPT must be a network for events, mambatm is none"):
+        measure(cfg, "mambatm")
+    cfg.scene.root = "/nowhere"
+    with pytest.raises(ValueError, match="^--root must be .*/nowhere"):
+        measure(cfg, "single256")
+
+
+def test_the_table_of_psfs_is_written_whole_and_once(tmp_path, monkeypatch):
+    def measure_error_tables(bands):
+        assert len(bands) == len(fit_p2s.PLANS) and not out.exists()
+        return {"errors.power": torch.zeros(2)}
+
+    out, shipped = tmp_path / "new.safetensors", fit_p2s.FILE.read_bytes()
+    monkeypatch.setattr(fit_p2s, "measure_error_tables", measure_error_tables)
+    monkeypatch.setattr("sys.argv", ["fit_p2s", "0", "--out", str(out)])
+    fit_p2s.main()
+    written, before = load_file(out), load_file(fit_p2s.FILE)
+    assert [name for name in written if name.startswith("errors.")] == ["errors.power"]
+    assert all(torch.equal(written[n], t) for n, t in before.items() if n[:7] != "errors.")
+    assert fit_p2s.FILE.read_bytes() == shipped and list(tmp_path.iterdir()) == [out]
 
 
 def test_a_camera_frame_is_found_in_a_list_with_comments_and_names_with_spaces(tmp_path):

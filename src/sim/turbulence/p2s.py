@@ -171,7 +171,12 @@ class PSFBand:
 @cache
 def load_bands_by_d_over_r0() -> tuple[PSFBand, ...]:
     """Return the fitted bands, weakest first."""
-    stored, bands = load_file(FILE), []
+    return read_bands(load_file(FILE))
+
+
+def read_bands(stored: Mapping[str, Tensor]) -> tuple[PSFBand, ...]:
+    """Return the bands of tensors as `scripts.fit_p2s` names them, weakest first."""
+    bands = []
     for index, edge in enumerate(stored["edges"].tolist()):
         networks = []
         for number, (modes, _) in enumerate(stored["sizes"][index].tolist()):
