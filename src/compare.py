@@ -49,7 +49,7 @@ def compare(cfg: DictConfig) -> dict:
     check_videos(cfg)
     names = _name_videos(cfg)
     _check_frame_rate(cfg)
-    kind, films = _chosen_slice(cfg), _read_films(cfg, names)
+    kind, (films, start_s) = _chosen_slice(cfg), _read_films(cfg, names)
     cuts = [slices.cut_slice(film, fps=cfg.fps, **{kind: cfg[kind]}) for film in films]
     scores, rows = {}, []
     for name, path, film, (across, _) in zip(names, cfg.videos, films, cuts, strict=True):
@@ -57,7 +57,7 @@ def compare(cfg: DictConfig) -> dict:
         scores[name] = _measure(film, across, cfg, kind) | camera
         rows.append(comparison.VideoRow(name, film, across, _format_note(scores[name])))
     with results.store_config_when_done(run, entry_point.resolved_yaml(cfg)):
-        _draw(rows, run / "comparison.png", cfg, kind, line=cuts[0][1])
+        _draw(rows, run / "comparison.png", cfg, kind, line=cuts[0][1], start_s=start_s)
     for row in rows:
         print(f"{row.name}: {'; '.join(row.note.splitlines())}")
     print(f"in {run}")
@@ -80,13 +80,14 @@ def _check_frame_rate(cfg: DictConfig) -> None:
             raise ValueError(f"fps must be that of {path}, {own:g}, got {cfg.fps}")
 
 
-def _read_films(cfg: DictConfig, names: Sequence[str]) -> list[np.ndarray]:
-    """Return the frames `first` to `last` of every video, of one size and number."""
-    read = (np.stack(list(videos.read_video(path, "videos"))) for path in cfg.videos)
-    films = {
-        name: _cut_part(film, cfg.first, cfg.last, name)
-        for name, film in zip(names, read, strict=True)
-    }
+def _read_films(cfg: DictConfig, names: Sequence[str]) -> tuple[list[np.ndarray], float]:
+    """Return the frames `first` to `last` of every video, of one size and number, and the time in s
+    of the first video's `first`."""
+    films, starts = {}, []
+    for name, path in zip(names, cfg.videos, strict=True):
+        film = np.stack(list(videos.read_video(path, "videos")))
+        films[name] = _cut_part(film, cfg.first, cfg.last, name)
+        starts.append(slice(cfg.first, cfg.last).indices(len(film))[0])
     lengths = {name: len(film) for name, film in films.items()}
     if (common := min(lengths.values())) < max(lengths.values()):
         listed = ", ".join(f"{name} {count}" for name, count in lengths.items())
@@ -97,7 +98,7 @@ def _read_films(cfg: DictConfig, names: Sequence[str]) -> list[np.ndarray]:
     sizes = {film.shape[1:] for film in films.values()}
     if len(sizes) > 1:
         raise ValueError(f"videos must be of one size (h, w), got {sorted(sizes)}")
-    return list(films.values())
+    return list(films.values()), starts[0] / cfg.fps
 
 
 def _cut_part(film: np.ndarray, first: int, last: int | None, name: str) -> np.ndarray:
@@ -140,11 +141,11 @@ def _format_note(scores: dict) -> str:
 
 def _draw(
     rows: Sequence[comparison.VideoRow], path: Path, cfg: DictConfig, kind: str,
-    line: slices.Points,
+    line: slices.Points, start_s: float,
 ) -> None:  # fmt: skip
     comparison.draw_comparison(
         rows, path, line=line, axis=slices.name_axis(kind, line), samples=cfg.frames_shown,
-        frame_s=1 / cfg.fps,
+        frame_s=1 / cfg.fps, start_s=start_s,
     )  # fmt: skip
 
 

@@ -9,7 +9,9 @@ import asyncio
 import signal
 import sys
 from collections.abc import Mapping, Sequence
+from copy import copy
 
+import numpy as np
 import torch
 from omegaconf import DictConfig
 
@@ -24,10 +26,10 @@ from src.live_view.page_server import THIS_MACHINE, LivePage, PageServer, find_p
 from src.live_view.player import Player
 from src.live_view.status import FaultLog, PipelineCounters
 from src.models.network import EventToVideoNetwork
-from src.recordings.files.event_file import ReadOptions
+from src.recordings.files.event_file import EVENT, ReadOptions
 from src.recordings.noise_filter import NoiseFilter
 from src.recordings.reconstruction import accepts_views, require_event_network, takes_all_views
-from src.recordings.sensor_lookup import build_lookup
+from src.recordings.sensor_lookup import SensorLookup, build_lookup
 from src.recordings.views import Views, load_views, views_or_whole_sensor
 from src.sim.optics import Position
 
@@ -105,7 +107,8 @@ def assemble_server(
 
     Raises ValueError for a value out of range.
     """
-    clock, counter = PlaybackClock(playback_speed), PolarityAccumulator(build_lookup(views))
+    clock, lookup = PlaybackClock(playback_speed), build_lookup(views)
+    counter = PolarityAccumulator(lookup)
     noise_filter = None if noise_filter_s is None else NoiseFilter(views.sensor, noise_filter_s)
     cutter = WindowCutter(
         views.sensor, settings.fps, faults, is_live=feed.is_live, noise_filter=noise_filter
@@ -114,7 +117,24 @@ def assemble_server(
     reader = FeedReader(feed, cutter, waiting, counter, clock, PipelineCounters(), faults)
     player = Player(reader, Controls(networks, views, settings), FrameRing(views.model))
     player.set_tone(tone, tone_time_constant_s)
-    return PageServer(LivePage(player, views.positions), host, port, allowed_origins)
+    server = PageServer(LivePage(player, views.positions), host, port, allowed_origins)
+    _load_kernels(cutter, lookup)
+    return server
+
+
+def _load_kernels(cutter: WindowCutter, lookup: SensorLookup) -> None:
+    """Cut and count a few events, out of order as well, and forget them, so that nothing is loaded
+    while the first events wait."""
+    counter, trial = PolarityAccumulator(lookup), copy(cutter)
+    counter.is_watched, trial.faults = True, FaultLog()
+    trial.restart()
+    events = np.zeros(100, EVENT)
+    events["t"], events["p"] = np.arange(100) * trial.period_us / 10, 1
+    for chunk in (events[:50], events[50:][::-1]):
+        trial.add(chunk)
+        for window in trial.pop_windows(trial.last_us):
+            counter.add(window.events)
+    cutter.restart()
 
 
 async def play_and_serve(server: PageServer) -> None:

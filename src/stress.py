@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from src import HOME
 from src.app import compared_networks, entry_point, simulation
-from src.app.instantiate import FUNCTIONS, build_part
+from src.app.instantiate import FUNCTIONS, as_dict, build_part
 from src.bench.candidates import Candidate
 from src.bench.stress_tests import arguments, stress_results
 from src.bench.stress_tests.event_clips import StressBench
@@ -37,8 +37,7 @@ def stress(cfg: DictConfig) -> stress_results.Outcomes:
         raise ValueError(f"clips must be >= 1, got {cfg.clips}")
     simulation.check_unscored_windows(cfg)
     run, config = Path(cfg.paths.run), entry_point.resolved_yaml(cfg)
-    candidates, _ = _load(config)
-    titles = {name: str(node.title) for name, node in cfg.stress_tests.items()}
+    candidates, titles, _ = _load(config)
     results.create_run_folder(run, config)
     outcomes: stress_results.Outcomes = {name: {} for name in titles}
     standard_psnr = {}
@@ -78,23 +77,26 @@ def _prepare_process() -> None:
 
 
 def _test_network(config: str, index: int) -> NetworkResults:
-    candidates, run_tests = _load(config)
+    candidates, _, run_tests = _load(config)
     return run_tests(candidates[index])
 
 
 @cache
-def _load(config: str) -> tuple[list[Candidate], Callable[[Candidate], NetworkResults]]:
-    """Return the networks and what runs the tests on one; ValueError for tests that are none, and
-    for their arguments."""
+def _load(
+    config: str,
+) -> tuple[list[Candidate], dict[str, str], Callable[[Candidate], NetworkResults]]:
+    """Return the networks, the tests' titles and what runs the tests on one; ValueError for tests
+    that are none, and for their arguments."""
     cfg = cast(DictConfig, OmegaConf.create(config))
     keys = {name: f"stress_tests.{name}.test" for name in cfg.stress_tests}
     tests = {name: build_part(cfg, key, _partial_=True) for name, key in keys.items()}
     pipeline = simulation.build_pipeline(cfg, "test")
     for name, key in keys.items():
         _check_arguments(key, tests[name], cfg.fps)
+    titles = {name: _fill_title(cfg, name, test) for name, test in tests.items()}
     bench = StressBench(pipeline, range(cfg.clips), cfg.data.unscored_windows)
     tester = partial(stress_results.run_stress_tests, tests=tests, bench=bench)
-    return compared_networks.load_candidates(cfg), tester
+    return compared_networks.load_candidates(cfg), titles, tester
 
 
 def _check_arguments(key: str, test: Callable[..., object], fps: float) -> None:
@@ -106,6 +108,12 @@ def _check_arguments(key: str, test: Callable[..., object], fps: float) -> None:
     except TypeError as error:
         raise ValueError(f"{key} must have the test's own arguments: {error}") from None
     arguments.check_arguments(key, test.func.__name__, test.keywords, fps)
+
+
+def _fill_title(cfg: DictConfig, name: str, test: partial[object]) -> str:
+    typed = {k: as_dict(v) if OmegaConf.is_config(v) else v for k, v in test.keywords.items()}
+    title = str(cfg.stress_tests[name].title)
+    return arguments.fill_title(f"stress_tests.{name}.title", title, typed)
 
 
 if __name__ == "__main__":

@@ -77,6 +77,13 @@ def test_a_wrong_value_is_one_line_and_exit_code_2_of_the_process(tmp_path):
     assert not list(tmp_path.rglob("results.json"))
 
 
+def test_a_typed_folder_of_a_run_is_refused_with_the_key_that_sets_it(tmp_path, capsys):
+    words = ["videos=[a]", f"paths.run={tmp_path}/x", f"paths.out={tmp_path}"]
+    assert run_here("compare", *words) == 2
+    said = "paths.run must be set as hydra.run.dir=FOLDER"
+    assert said in capsys.readouterr().err and not (tmp_path / "x").exists()
+
+
 @pytest.mark.parametrize("below", ["", "/run"])
 def test_a_file_where_the_folder_of_a_run_should_be_is_one_line(below, tmp_path, capsys):
     (tmp_path / "notes.txt").write_text("kept")

@@ -512,6 +512,18 @@ def test_of_videos_of_two_lengths_the_common_frames_are_compared(tmp_path, capsy
     assert "the first 4 of these frames of each are compared: a 9, b 4" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(("first", "start_s"), [(3, 0.025), (-2, 0.05)])
+def test_times_of_a_comparison_are_those_of_the_video(first, start_s, tmp_path, monkeypatch):
+    (tmp_path / "a").mkdir()
+    for k in range(8):
+        cv2.imwrite(str(tmp_path / f"a/{k}.png"), np.full((20, 20), 30 * k, np.uint8))
+    told = {}
+    monkeypatch.setattr(comparison, "draw_comparison", lambda *_, **how: told.update(how))
+    cut = f"videos=[{tmp_path}/a]", "line=[[0,0],[9,0]]", f"first={first}"
+    compare(config("compare", tmp_path / "run", *cut))
+    assert told["start_s"] == pytest.approx(start_s)
+
+
 def test_a_measure_that_two_frames_do_not_show_is_a_dash(tmp_path, capsys):
     (tmp_path / "film").mkdir()
     y, x = np.mgrid[:20, :80]

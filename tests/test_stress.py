@@ -54,6 +54,16 @@ def test_map_table_and_text_are_written(tmp_path):
     assert "retention" in text and "Not run, because" in text
 
 
+def test_titles_follow_the_arguments(tmp_path):
+    title = "stress_tests.retention.title='{windows.last:,} windows'"
+    one = "+networks={one: {baseline: {_target_: baselines.highpass.HighPass}, views: 1}}"
+    typed = [one, title, "stress_tests.retention.test.windows=[5]"]
+    stress(tiny(tmp_path, *typed, "~stress_tests.dropout", "~stress_tests.fast"))
+    assert "5 windows" in (tmp_path / "stress.md").read_text()
+    with pytest.raises(ValueError, match=r"^stress_tests\.fast\.title must name arguments of its"):
+        stress(tiny(tmp_path / "b", one, "stress_tests.fast.title='{foo}'"))
+
+
 def test_a_single_view_has_no_views_to_lose(tmp_path):
     networks = "+networks={one: {baseline: {_target_: baselines.highpass.HighPass}, views: 1}}"
     assert "centre view only" in stress(tiny(tmp_path, networks))["dropout"]["one"]

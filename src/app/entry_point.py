@@ -147,10 +147,16 @@ def run_job(
     """Run `work` in the folder Hydra made for this job, alone in it; end W&B's run.
 
     A job of a sweep is skipped where its results stand and the weights it tests are older; its
-    error is stored.  Raises ValueError where another process works in the folder.
+    error is stored.  Raises ValueError where another process works in the folder, and for a folder
+    that is typed as `paths.run`.
     """
     refuse_renamed_keys(cfg)
     job = HydraConfig.get()
+    if is_set_on_command_line("paths.run"):
+        why = "of a sweep: hydra.sweep.dir=FOLDER"
+        raise ValueError(
+            f"paths.run must be set as hydra.run.dir=FOLDER, {why}, got {cfg.paths.run}"
+        )
     cfg.paths.run = job.runtime.output_dir
     check_values(cfg)
     _silence_expected_warnings()

@@ -120,22 +120,39 @@ def select_by_one_standard_error(
     return min((name for name in errors if is_near(errors[name])), key=costs.__getitem__)
 
 
+def find_networks_without_score(scores: Sequence[ClipScore]) -> dict[str, list[str]]:
+    """Return {severity: the networks whose error is not finite on one of its clips or more}."""
+    found: dict[str, list[str]] = {}
+    for score in scores:
+        row = found.setdefault(score.severity, [])
+        if not math.isfinite(_error(score)) and score.network not in row:
+            row.append(score.network)
+    return {severity: networks for severity, networks in found.items() if networks}
+
+
+def _error(score: ClipScore) -> float:
+    """Return LPIPS, else 1 - SSIM; NaN of a clip that has none."""
+    ssim = score.values.get("ssim")
+    error = score.values.get("lpips", None if ssim is None else 1 - ssim)
+    return math.nan if error is None else error
+
+
 def recommend_network_per_severity(
     speeds: Sequence[SpeedMeasurement], scores: Sequence[ClipScore], side: int
 ) -> dict[str, str]:
     """Return {severity: the cheapest network within one standard error of the best}, none for
     fewer than two clips, of which there is no standard error.
 
-    By LPIPS, else by 1 - SSIM; the cost is the thread time in ms on frames of `side`, in the
-    fastest form.
+    By LPIPS, else by 1 - SSIM; a network without a finite one on every clip is left out.  The cost
+    is the thread time in ms on frames of `side`, in the fastest form.
     """
     costs = {name: s.ms or math.inf for name, s in find_fastest_forms(speeds, side).items()}
     errors: dict[str, dict[str, list[float]]] = {}
+    left_out = find_networks_without_score(scores)
     for score in scores:
         row = errors.setdefault(score.severity, {})
-        if score.network in costs:
-            error = score.values.get("lpips", 1 - score.values["ssim"])
-            row.setdefault(score.network, []).append(error)
+        if score.network in costs and score.network not in left_out.get(score.severity, ()):
+            row.setdefault(score.network, []).append(_error(score))
     return {
         name: select_by_one_standard_error(costs, row)
         for name, row in errors.items()
@@ -156,6 +173,9 @@ def format_chart_summary(
     times = [f"ms, {count} thread{'s' * (count > 1)}" for count in threads]
     lines = ["# Speed against accuracy\n"]
     lines += [f"- {severity} turbulence: take {name}." for severity, name in recommended.items()]
+    for severity, networks in find_networks_without_score(scores).items():
+        names = ", ".join(networks)
+        lines.append(f"- {severity} turbulence: not every clip has a finite score of {names}.")
     lines += [
         f"\nMs from events to a frame of {side}x{side}; in rows of the form that is fastest on one "
         "thread the means over all clips, in float32.  No weights: timed only.\n",

@@ -27,10 +27,11 @@ class VideoRow:
 
 def draw_comparison(
     rows: Sequence[VideoRow], path: Path, *, line: Float[np.ndarray, "k 2"], frame_s: float,
-    samples: int = 4, axis: str = "x",
+    start_s: float = 0.0, samples: int = 4, axis: str = "x",
 ) -> None:  # fmt: skip
     """Draw one row per video: so many `samples` of its frames, the `line` (x, y) of the slice in
-    yellow on the first, and the slice with time downwards, `frame_s` seconds a frame.
+    yellow on the first, and the slice with time downwards, `frame_s` seconds a frame, the first at
+    `start_s`.
 
     `axis` names the coordinate along the line: x, y, r, in pixels, or theta, in degrees.
     """
@@ -50,7 +51,8 @@ def draw_comparison(
             panel.set(xticks=[], yticks=[])
         axes[0].plot(*line.T, color=LINE_COLOUR, linewidth=1)
         axes[0].set_ylabel(row.name, fontsize=min(9, 100 * panel_height / max(len(row.name), 1)))
-        extent = (first, last, 1e3 * frame_s * len(row.slice), 0)
+        ends_ms = 1e3 * start_s, 1e3 * (start_s + frame_s * len(row.slice))
+        extent = (first, last, ends_ms[1], ends_ms[0])
         axes[samples].imshow(row.slice, aspect="auto", extent=extent, vmin=0, vmax=1)
         axes[samples].tick_params(labelsize=6)
         axes[samples].set_xlabel(f"{axis}, {unit}", fontsize=6, labelpad=1)
@@ -59,7 +61,7 @@ def draw_comparison(
             beside.set_axis_off()
             beside.text(0, 1, row.note, fontsize=8, va="top", transform=beside.transAxes)
     for sample, panel in zip(picks, grid[0], strict=False):
-        panel.set_title(f"{1e3 * frame_s * sample:.1f} ms", fontsize=8)
+        panel.set_title(f"{1e3 * (start_s + frame_s * sample):.1f} ms", fontsize=8)
     grid[0, samples].set_title(f"{axis}-t, {1e3 * frame_s * shortest:.0f} ms", fontsize=8)
     save_figure(figure, path)
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from statistics import stdev
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,7 @@ def draw_accuracy_against_time(
 ) -> Path:  # fmt: skip
     """Draw the float32 scores of every network at the thread time of its fastest form on frames of
     `side`, with a line to its fastest time on more threads; the dashed line is the Pareto front.
+    The bars are the standard error of the difference to the best network on the same clips.
     The title ends with the number of clips; the paper's time is drawn at its own size.
     """
     timed = find_fastest_forms(speeds, side)
@@ -63,6 +65,7 @@ def _draw_metric(
 ) -> dict[str, Span]:  # fmt: skip
     """Draw the panel of `metric`, all but names; return where each network is."""
     spans: dict[str, Span] = {}
+    errors_of_difference = compute_errors_of_difference(metric, scores)
     for name, fastest in timed.items():
         values = [score.values[metric.name] for score in scores if score.network == name]
         mean = mean_score(values)
@@ -71,6 +74,9 @@ def _draw_metric(
             spans[name] = least, fastest.ms, mean
             line, colour = ([least, fastest.ms], [spans[name][2]] * 2), _colour(fastest)
             axes.plot(*line, "o-", markevery=[1], color=colour, lw=1.2)
+            error = errors_of_difference.get(name, 0.0)
+            if error > 0:
+                axes.vlines(fastest.ms, mean - error, mean + error, color=colour, lw=0.8)
     errors = {key: (ms, -metric.better * score) for key, (_, ms, score) in spans.items()}
     front = np.array([spans[key][1:] for key in find_pareto_front(errors)]).reshape(-1, 2)
     axes.plot(*front.T, color="0.35", ls="--", lw=1, zorder=0)
@@ -83,6 +89,26 @@ def _draw_metric(
     axes.margins(0.12, 0.08)
     axes.grid(alpha=0.25)
     return spans
+
+
+def compute_errors_of_difference(metric: Column, scores: Sequence[ClipScore]) -> dict[str, float]:
+    """Return {network: standard error of its mean difference of `metric` to the best network's},
+    over the clips of both; none where they are fewer than two.
+    """
+    values: dict[str, dict[tuple[str, int], float]] = {}
+    for score in scores:
+        value = score.values[metric.name]
+        if value is not None and np.isfinite(value):
+            values.setdefault(score.network, {})[score.severity, score.clip] = value
+    if not values:
+        return {}
+    best = max(values.values(), key=lambda own: metric.better * np.mean(list(own.values())))
+    found = {}
+    for name, own in values.items():
+        more = [own[clip] - best[clip] for clip in own.keys() & best.keys()]
+        if len(more) > 1:
+            found[name] = stdev(more) / len(more) ** 0.5
+    return found
 
 
 def _mark_times(axes: Axes, marks: Mapping[float, str]) -> None:
@@ -107,7 +133,10 @@ def _draw_legend(figure: Figure, timed: Mapping[str, SpeedMeasurement]) -> None:
     named = {_colour(s): "one view" if s.views == 1 else f"{s.views} views" for s in timed.values()}
     handles = [Line2D([], [], ls="none", marker="o", color=c, label=n) for c, n in named.items()]
     handles.append(Line2D([], [], ls="--", lw=1, color="0.35", label="Pareto front"))
-    figure.legend(handles=handles, loc="outside lower right", ncols=3, frameon=False)
+    bar = {"marker": "|", "markersize": 11, "markeredgewidth": 0.8, "color": "0.35"}
+    what = "standard error of the difference to the best"
+    handles.append(Line2D([], [], ls="none", label=what, **bar))
+    figure.legend(handles=handles, loc="outside lower right", ncols=4, frameon=False)
 
 
 def _name_points(axes: Axes, spans: Mapping[str, Span]) -> None:
@@ -115,7 +144,7 @@ def _name_points(axes: Axes, spans: Mapping[str, Span]) -> None:
     nearest to its own point, else where it covers and is near to the fewest others."""
     to_px = axes.transData.transform
     lines = [_box(to_px((least, score)), to_px((ms, score))) for least, ms, score in spans.values()]
-    taken = lines + [text.get_window_extent() for text in axes.texts]
+    taken = lines + [drawn.get_window_extent() for drawn in (*axes.texts, *axes.collections)]
     for (name, span), own in zip(spans.items(), lines, strict=True):
         written = [_write(axes, name, span, place) for place in NAME_PLACES]
         boxes = [text.get_window_extent().padded(CLEARANCE_PX) for text in written]

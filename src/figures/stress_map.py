@@ -19,7 +19,7 @@ ROW_IN, COLUMN_IN, TITLE_IN = 0.34, 0.98, 4.6
 NOT_RUN: dict[str, Any] = {"facecolor": "#efefef", "hatch": "////"}
 LEGEND = """under the name: aligned PSNR on the standard clips
 blue: within the limit; orange: beyond it, deep at 10 times
-hatched: did not run, stress.md says why"""
+hatched: did not run, stress.md says why; ∞: not within the clip; –: no number"""
 
 
 def draw_stress_map(

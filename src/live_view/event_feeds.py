@@ -178,7 +178,8 @@ def _bind_udp_socket(url: str) -> socket.socket:
 
 
 class CameraFeed(Feed):
-    """A camera that faery's drivers read; lost, it is looked for again.
+    """A camera that faery's drivers read; lost, it is looked for again: one of another sensor size
+    is not taken.
 
     Raises ValueError where there is none, or no driver.
     """
@@ -186,14 +187,13 @@ class CameraFeed(Feed):
     def __init__(self, faults: FaultLog):
         self.faults = faults
         self.stream = _open_camera()
-        width, height = self.stream.dimensions()
-        self.sensor = (int(height), int(width))
+        self.sensor = _sensor_of_camera(self.stream)
 
     def iter_event_chunks(self, stopped: threading.Event) -> Chunks:
         """Yield what the camera sends."""
         while not stopped.is_set():
             try:
-                stream = _open_camera() if self.stream is None else self.stream
+                stream = self._open_same_camera() if self.stream is None else self.stream
                 self.faults.clear("camera")
                 for packet in stream:
                     events = _as_events(packet["t"], packet["x"], packet["y"], packet["on"])
@@ -209,8 +209,21 @@ class CameraFeed(Feed):
             self.faults.report("camera", text, until_cleared=True)
             stopped.wait(RETRY_S)
 
+    def _open_same_camera(self):
+        """Return the stream of a camera; raises ValueError for one of another sensor size."""
+        stream = _open_camera()
+        if (found := _sensor_of_camera(stream)) != self.sensor:
+            sizes = [f"{width}x{height}" for height, width in (self.sensor, found)]
+            raise ValueError("the sensor must be {} as before, got a camera of {}".format(*sizes))
+        return stream
+
     def close(self) -> None:
         self.stream = None
+
+
+def _sensor_of_camera(stream) -> HeightWidth:
+    width, height = stream.dimensions()
+    return int(height), int(width)
 
 
 def _open_camera():

@@ -4,6 +4,7 @@ Written by the threads that cut and reconstruct, read by the page's.  Colours ar
 """
 
 import threading
+import time
 from collections.abc import Sequence
 
 import cv2
@@ -39,12 +40,20 @@ class FrameRing:
         self.size = size
         kept = max(2, min(MAX_FRAMES, MAX_BYTES // (size[0] * size[1])))
         self.ring = np.zeros((kept, *size), np.uint8)
+        self.pushed_s = np.zeros(kept)  # wall time of each frame of the ring
         self.count = 0  # frames since the start
 
     def push(self, picture: Float[np.ndarray, "h w"]) -> None:
         """Add a frame in [0, 1]."""
         cv2.convertScaleAbs(picture, dst=self.ring[self.count % len(self.ring)], alpha=255)
+        self.pushed_s[self.count % len(self.ring)] = time.perf_counter()
         self.count += 1
+
+    def length_s(self) -> float | None:
+        """Return the wall time from the oldest to the newest frame of the ring in seconds; None of
+        fewer than two."""
+        pushed_s = self.pushed_s[: self.count].copy()
+        return float(np.ptp(pushed_s)) if len(pushed_s) > 1 else None
 
     def newest(self) -> UInt8[np.ndarray, "h w"] | None:
         """Return a copy of the newest frame; None before the first."""

@@ -78,11 +78,10 @@ class LivePage:
 
     def status(self) -> dict:
         """Return the meters, and what is chosen and offered."""
-        status = self.player.status()
-        asked_fps = status["asked_fps"]
+        status, slice_s = self.player.status(), self.frames.length_s()
         return status | {
             "line": self.slice.line,
-            "slice_s": round(len(self.frames.ring) / asked_fps, 2) if asked_fps else None,
+            "slice_s": None if slice_s is None else round(slice_s, 2),
             "all_views": self.all_views,
             "one_view": self.controls.one_view_runner is not None,
             "offered": self.controls.offered,

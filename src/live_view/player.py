@@ -66,12 +66,12 @@ class Player:
             window, runner = self.reader.waiting.get(0.1), self.controls.runner
             if window is None or runner is None:
                 continue
-            start = time.perf_counter()
+            start = time.thread_time()
             is_new = window.starts_scene or runner is not self.running
             self.running = runner
             finish = runner.begin(window, restart=is_new)
             beside = self._begin_one_view(window)
-            self.meters.add_busy_time("events", time.perf_counter() - start)
+            self.meters.add_busy_time("events", time.thread_time() - start)
             while not stopped.is_set():
                 try:
                     self.begun.put((window, finish, beside), timeout=0.1)
@@ -97,13 +97,12 @@ class Player:
                 window, finish, beside = self.begun.get(timeout=0.1)
             except queue.Empty:
                 continue
-            start, end_s = time.perf_counter(), window.end_us * 1e-6
+            start, end_s = time.thread_time(), window.end_us * 1e-6
             self.frames.push(self.tone.apply(finish(), end_s))
             self.one_view = None if beside is None else self.one_view_tone.apply(beside(), end_s)
             self.shown_us = window.end_us
-            end = time.perf_counter()
-            self.meters.add_busy_time("network", end - start)
-            self.meters.add_frame(end - window.due_s, len(window.events))
+            self.meters.add_busy_time("network", time.thread_time() - start)
+            self.meters.add_frame(time.perf_counter() - window.due_s, len(window.events))
 
     def set_paused(self, paused: bool) -> None:
         """Pause or play.  What a live stream sends during a pause is left out."""
@@ -113,12 +112,14 @@ class Player:
     def _suggest_fps(self, reached: float, asked: float) -> str | None:
         """Return what to set where windows are dropped now, in frames per second of recorded time;
         None where they are not.  `reached` and `asked` are per second of the clock on the wall.
+
+        What a window costs is that of the present ones: of longer ones, with more events, more.
         """
         suggested = math.floor(SPARED * reached / self.reader.clock.speed)
         is_short = self.reader.state == "playing" and reached < SPARED * asked < math.inf
         if not (is_short and self.reader.waiting.dropped and suggested):
             return None
-        return f"fps={suggested} (of recorded time) would drop nothing on this machine"
+        return f"fps={suggested} or less (of recorded time) drops fewer; longer windows take longer"
 
     def status(self) -> dict:
         """Return what `GET /status` answers, all but the page's own."""

@@ -57,7 +57,7 @@ class PipelineCounters:
             self._forget(now)
 
     def add_busy_time(self, stage: str, seconds: float) -> None:
-        """Count `seconds` of work of a stage."""
+        """Count `seconds` of CPU time of a stage's thread."""
         self.busy_s[stage] += seconds
 
     def _forget(self, now: float) -> None:
@@ -81,7 +81,8 @@ class PipelineCounters:
         }
 
     def stage_cpu_shares(self) -> dict[str, float]:
-        """Return the share of a core that each stage took since about a second before."""
+        """Return the share of a core, CPU time of its thread, that each stage took since about a
+        second before."""
         now, busy = time.perf_counter(), dict(self.busy_s)
         at, before = self.before
         if now - at >= 1.0:

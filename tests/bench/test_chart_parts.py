@@ -1,5 +1,8 @@
 """The Pareto front, the one-standard-error rule and timing on what is known."""
 
+import math
+
+import pytest
 import torch
 
 from src.bench.speed import SpeedMeasurement
@@ -7,6 +10,7 @@ from src.bench.speed_accuracy import (
     ClipScore,
     find_fastest_forms,
     find_pareto_front,
+    format_chart_summary,
     recommend_network_per_severity,
     select_by_one_standard_error,
 )
@@ -37,6 +41,20 @@ def test_a_network_costs_what_its_fastest_form_takes_on_one_thread():
     scores = [ClipScore(name, "weak", clip, {"ssim": 0.5}) for name in "ab" for clip in (0, 1)]
     assert recommend_network_per_severity(speeds, scores, 64) == {"weak": "a"}
     assert recommend_network_per_severity(speeds, scores[::2], 64) == {}, "of one clip each"
+
+
+@pytest.mark.parametrize("wrong", [math.nan, math.inf, None])
+def test_a_network_without_a_finite_score_is_left_out_with_a_line(wrong):
+    speeds = [SpeedMeasurement(name, True, 9, 64, "cpu", 1, "float32", ms=1.0) for name in "ab"]
+    scores = [ClipScore("a", "weak", clip, {"lpips": 0.3}) for clip in (0, 1)]
+    scores += [
+        ClipScore("b", "weak", clip, {"lpips": value}) for clip, value in ((0, 0), (1, wrong))
+    ]
+    recommended = recommend_network_per_severity(speeds, scores, 64)
+    assert recommended == {"weak": "a"}
+    text = format_chart_summary(speeds, scores, recommended, 64)
+    assert "- weak turbulence: not every clip has a finite score of b.\n" in text
+    assert recommend_network_per_severity(speeds, scores[2:], 64) == {}
 
 
 class Doubling(EventToVideoNetwork):

@@ -51,6 +51,26 @@ def test_the_papers_time_is_drawn_at_its_own_size_and_clips_are_counted(
     assert drawn[0].get_suptitle() == "t, 4 clips" and "aligned PSNR, dB" in axes.get_title()
 
 
+def test_bars_are_the_error_of_the_difference_to_the_best(tmp_path, monkeypatch):
+    psnr = {"best": [20, 30, 40], "less": [19, 28, 37], "none": [None, float("nan"), 5.0]}
+    scores = [
+        ClipScore(name, "weak", clip, {"psnr_aligned": value})
+        for name, row in psnr.items()
+        for clip, value in enumerate(row)
+    ]
+    (metric,) = (metric for metric in frontier.DRAWN if metric.name == "psnr_aligned")
+    found = frontier.compute_errors_of_difference(metric, scores)
+    assert found == pytest.approx({"best": 0.0, "less": 1 / 3**0.5})
+    drawn = []
+    monkeypatch.setattr(frontier, "save_figure", lambda figure, path: drawn.append(figure) or path)
+    speeds = [SpeedMeasurement(n, True, 9, 64, "cpu", 1, "float32", ms=5.0) for n in psnr]
+    frontier.draw_accuracy_against_time(tmp_path / "a", speeds, scores[:6], side=64, title="t")
+    (bar,) = drawn[0].axes[0].collections
+    assert bar.get_segments()[0][:, 1] == pytest.approx([28 - 1 / 3**0.5, 28 + 1 / 3**0.5])
+    told = [text.get_text() for text in drawn[0].legends[0].get_texts()]
+    assert "standard error of the difference to the best" in told
+
+
 def test_a_name_does_not_cover_the_text_of_a_line():
     figure = Figure(figsize=(7, 6))
     axes = figure.subplots()

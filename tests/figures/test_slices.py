@@ -113,6 +113,11 @@ def test_times_and_places_of_a_comparison_are_those_of_the_frames(tmp_path, monk
     assert slice_panel.get_title() == "x-t, 25 ms"
     assert slice_panel.images[0].get_extent() == pytest.approx([39.5, 120.5, 25, 0])
     assert (slice_panel.get_xlabel(), slice_panel.get_ylabel()) == ("x, px", "t, ms")
+    later = {"frame_s": 1 / 120, "start_s": 0.1, "samples": 2}
+    draw_comparison(rows, tmp_path / "a.png", line=points, **later)
+    first, last, slice_panel = drawn[1].axes
+    assert [first.get_title(), last.get_title()] == ["100.0 ms", "116.7 ms"]
+    assert slice_panel.images[0].get_extent() == pytest.approx([39.5, 120.5, 125, 100])
 
 
 @pytest.mark.parametrize(

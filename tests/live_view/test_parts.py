@@ -302,6 +302,17 @@ def test_the_buffer_is_bounded():
     assert FrameRing((2160, 3840)).ring.nbytes <= MAX_BYTES
 
 
+def test_the_length_of_the_slice_is_the_wall_time_of_its_frames(monkeypatch):
+    frames = frame_buffer.FrameRing((8, 8))
+    frames.pushed_s, frames.ring = frames.pushed_s[:4], frames.ring[:4]
+    lengths = []
+    for now in (10.0, 10.5, 11.0, 14.0, 14.25, 14.5):
+        monkeypatch.setattr(frame_buffer.time, "perf_counter", lambda now=now: now)
+        frames.push(np.zeros((8, 8), np.float32))
+        lengths.append(frames.length_s())
+    assert lengths == [None, 0.5, 1.0, 4.0, 3.75, 3.5]
+
+
 def test_event_pictures_count_where_a_view_looks_and_only_while_watched():
     lookup = build_lookup(scenes.views())
     marks = PolarityAccumulator(lookup)

@@ -1,7 +1,8 @@
-"""What the arguments of stress tests may be, told before any of them runs."""
+"""What the arguments of stress tests may be, told before any of them runs; titles with them."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
+from types import SimpleNamespace
 from typing import Any
 
 from src.bench.stress_tests.event_clips import ClipConditions
@@ -25,6 +26,26 @@ def check_arguments(key: str, function: str, given: Mapping[str, Any], fps: floa
     for name, (allowed, rule) in _list_rules(function, given, fps).items():
         if name in given and not _is_allowed(rule, given[name]):
             raise ValueError(f"{key}.{name} must be {allowed}, got {given[name]}")
+
+
+def fill_title(key: str, title: str, arguments: Mapping[str, Any]) -> str:
+    """Return `title` with each {argument}, and {argument.least}, {argument.most} or {argument.last}
+    of a list of numbers, in its place; raises ValueError, which begins with `key`, for others.
+    """
+    try:
+        return title.format(**{name: _name_ends(value) for name, value in arguments.items()})
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError):
+        allowed = "{argument} or {list.least}, {list.most}, {list.last}"
+        names = ", ".join(arguments)
+        text = f"{key} must name arguments of its test as {allowed}, of {names}, got {title}"
+        raise ValueError(text) from None
+
+
+def _name_ends(value: Any) -> Any:
+    """Return the ends of a list of numbers by their names; anything else as it is."""
+    if not isinstance(value, Sequence) or not all(isinstance(v, int | float) for v in value):
+        return value
+    return SimpleNamespace(least=min(value), most=max(value), last=value[-1]) if value else value
 
 
 def _list_rules(function: str, given: Mapping[str, Any], fps: float) -> dict[str, Rule]:

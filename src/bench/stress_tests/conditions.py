@@ -10,7 +10,13 @@ import torch
 from torch import Tensor
 
 from src.bench.candidates import Candidate
-from src.bench.stress_tests.event_clips import ClipConditions, EventClip, StressBench, require_type
+from src.bench.stress_tests.event_clips import (
+    ClipConditions,
+    EventClip,
+    StressBench,
+    compute_losses_against_best,
+    require_type,
+)
 from src.bench.stress_tests.stress_results import StressResult, build_worst_psnr_loss_result
 from src.metrics.video_metrics import score_aligned_psnr
 from src.models.network import unroll
@@ -31,14 +37,16 @@ def measure_worst_psnr_loss(
 
     `parameter` and the keys of `fixed` and `reference`: a field of ClipConditions such as
     d_over_r0, `sensor.<argument>` of EventSensor or `turbulence.<argument>` of SimulatedTurbulence.
-    `fixed` is set with every value; the loss is against clips of the `reference` settings.
+    `fixed` is set with every value; the loss is against the best of clips of the `reference`
+    settings and of the values before.
     """
 
     def psnr(settings: Mapping[str, Any]) -> float:
         return bench.mean_aligned_psnr(network, ClipConditions.from_settings(settings))
 
     base = psnr(reference or {})
-    curve = [(value, base - psnr({parameter: value, **(fixed or {})})) for value in values]
+    scores = [(value, psnr({parameter: value, **(fixed or {})})) for value in values]
+    curve = compute_losses_against_best(base, scores)
     return build_worst_psnr_loss_result(curve, limit_db=limit_db, varied=parameter)
 
 
@@ -91,7 +99,8 @@ def measure_window_rate_loss(
 
     clips = bench.clips()
     base = fmean(score(clip, clip.fps) for clip in clips)
-    curve = [(rate, base - fmean(score(clip, rate) for clip in clips)) for rate in rates_hz]
+    scores = [(rate, fmean(score(clip, rate) for clip in clips)) for rate in rates_hz]
+    curve = compute_losses_against_best(base, scores)
     return build_worst_psnr_loss_result(curve, limit_db=limit_db, varied="windows a second")
 
 
@@ -128,13 +137,14 @@ def measure_worst_view_dropout_loss(
     A network that takes any number of views is given the others; one of a fixed number sees zeros.
     """
     require_views(network, max(counts) + 1)
-    base, rng, curve = bench.mean_aligned_psnr(network), np.random.default_rng(0), []
+    rng, scores = np.random.default_rng(0), []
     middle = most_central_view_index(layout(network.views))
     for count in counts:
         lost = [rng.permutation(network.views)[:count].tolist() for _ in range(draws)]
         lost[0] = [middle, *(v for v in lost[0] if v != middle)][:count]  # the centre view, too
-        losses = [base - _psnr_without_views(network, bench, views) for views in lost]
-        curve.append((count, float(np.max(losses))))
+        drawn = [_psnr_without_views(network, bench, views) for views in lost]
+        scores.append((count, float(np.min(drawn))))
+    curve = compute_losses_against_best(bench.mean_aligned_psnr(network), scores)
     return build_worst_psnr_loss_result(curve, limit_db=limit_db, varied="views lost")
 
 

@@ -42,6 +42,15 @@ Film = Float[Tensor, "frames h w"]
 Video = Float[Tensor, "windows 1 h w"]
 
 
+def compute_losses_against_best(reference_db: float, scores_db: Curve) -> Curve:
+    """Return (setting, dB lost) of each setting against the best of the reference and the settings
+    before it; NaN from the first score on that is NaN.
+    """
+    scores = [score for _, score in scores_db]
+    best = np.maximum.accumulate([reference_db, *scores])
+    return [(name, float(b - s)) for (name, s), b in zip(scores_db, best[:-1], strict=True)]
+
+
 @dataclass(frozen=True)
 class ClipConditions:
     """How a clip differs from the standard one.
@@ -265,10 +274,8 @@ class StressBench:
         self, network: Candidate, changes: Mapping[Any, Callable[[Tensor], Tensor]]
     ) -> Curve:
         """Return (setting, dB lost) for each change of the windows of the standard clips."""
-        base = self.mean_aligned_psnr(network)
-        return [
-            (name, base - self.mean_aligned_psnr(network, change=c)) for name, c in changes.items()
-        ]
+        scores = [(name, self.mean_aligned_psnr(network, change=c)) for name, c in changes.items()]
+        return compute_losses_against_best(self.mean_aligned_psnr(network), scores)
 
     def clip_aligned_psnr(self, frames: Video, clip: EventClip) -> float:
         """Return the mean of `score_aligned_psnr` over the frames after the warm-up; NaN where no

@@ -9,7 +9,13 @@ import numpy as np
 
 from src.bench.candidates import Candidate
 from src.bench.stress_tests.conditions import require_views
-from src.bench.stress_tests.event_clips import US_PER_S, Curve, EventClip, StressBench
+from src.bench.stress_tests.event_clips import (
+    US_PER_S,
+    Curve,
+    EventClip,
+    StressBench,
+    compute_losses_against_best,
+)
 from src.bench.stress_tests.stress_results import StressResult, build_worst_psnr_loss_result
 from src.metrics.video_metrics import score_aligned_psnr
 from src.sim.optics import Position, layout, most_central_view_index
@@ -97,6 +103,5 @@ def _second_half_losses(
 
     clips = bench.clips()
     base = fmean(map(score, clips))
-    return [
-        (name, base - fmean(score(fault(clip)) for clip in clips)) for name, fault in faults.items()
-    ]
+    scores = [(name, fmean(score(fault(clip)) for clip in clips)) for name, fault in faults.items()]
+    return compute_losses_against_best(base, scores)

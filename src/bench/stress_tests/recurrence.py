@@ -22,25 +22,39 @@ from src.models.network import unroll
 from src.sim import noise
 
 SCORED_EVERY = 4  # windows of a long run
+LEAST_RMS = 1e-12  # difference of frames, below which there is none
 
 
 def measure_contrast_retention_percent(
     network: Candidate, bench: StressBench, *, limit_percent: float, windows: Sequence[int]
 ) -> StressResult:
-    """Return the contrast kept, in %, after the last number of `windows` without an event."""
+    """Return the contrast kept, in %, after the last number of `windows` without an event: the
+    contrast against that of the last frame with events, times the squared correlation with it, so
+    that noise in the picture's place is not contrast kept; of an inverted picture it is negative.
+    """
     per_clip = []
     for clip in bench.clips():
         given = list(clip.windows())
         frames, state = clip.reconstruct(network, given)
-        before, kept = float(frames[-1].std()), []
+        before, kept = frames[-1], []
         for done, count in zip((0, *windows), windows, strict=False):
             empty = [torch.zeros_like(given[0])] * (count - done)
             frames, state = clip.reconstruct(network, empty, state)
-            kept.append(100 * float(frames[-1].std()) / max(before, 1e-9))
+            kept.append(100 * _kept_contrast(before, frames[-1]))
         per_clip.append(kept)
     kept = torch.tensor(per_clip).mean(0).tolist()
     curve = list(zip(windows, kept, strict=True))
     return StressResult(kept[-1], "%", limit_percent, curve, "empty windows", True)
+
+
+def _kept_contrast(before: Tensor, after: Tensor) -> float:
+    """Return std(after) / std(before) times the signed square of their correlation; 0 where one
+    has no contrast, NaN where a value is none.
+    """
+    before, after = ((frame - frame.mean()).double() for frame in (before, after))
+    spread = before.square().mean().sqrt(), after.square().mean().sqrt()
+    shared = (before * after).mean() / (spread[0] * spread[1]).clamp(min=1e-12)
+    return float(spread[1] / spread[0].clamp(min=1e-9) * shared * shared.abs())
 
 
 def measure_long_sequence_drift(
@@ -71,7 +85,7 @@ def measure_convergence_windows(
     network: Candidate, bench: StressBench, *, limit_windows: float, within_db: float = 1.0
 ) -> StressResult:
     """Return the windows until the frame is within `within_db` of the clip's second half, for good;
-    a clip that never gets there counts half its length.
+    inf where one clip does not get there in its first half.
     """
     scores = [aligned_psnr(clip.reconstruct(network)[0], clip.truth) for clip in bench.clips()]
     times = [count_settling_windows(s, within_db) for s in scores]
@@ -83,7 +97,8 @@ def measure_flicker_recovery(
     events_per_pixel: float = 3.0, within_db: float = 1.0,
 ) -> StressResult:  # fmt: skip
     """Return the windows until the frame is back within `within_db` after `flicker_windows`
-    windows in which every pixel makes `events_per_pixel` ON events, in the next as many OFF events.
+    windows in which every pixel makes `events_per_pixel` ON events, in the next as many OFF events;
+    inf where it is not back by the end of one clip.
     """
     times = []
     for clip in bench.clips():
@@ -129,7 +144,8 @@ def measure_input_perturbation_growth(
     """Return the growth exponent, per window, of a perturbation of `perturbation_rms` in one.
 
     Fitted to the logarithm of the rms difference of the frames (a Lyapunov exponent); above 0 the
-    perturbation grows.  The first `skipped_windows` windows after it do not count.
+    perturbation grows, at 0 it has no effect.  The first `skipped_windows` windows after it do not
+    count.
     """
     exponents = []
     for clip in bench.clips():
@@ -142,9 +158,18 @@ def measure_input_perturbation_growth(
         changed = [*windows[:start], perturbed, *windows[start + 1 :]]
         other, _ = clip.reconstruct(network, changed)
         difference = (plain - other)[start + skipped_windows :].double()
-        logs = difference.square().mean((1, 2, 3)).sqrt().clamp(min=1e-12).log()
-        exponents.append(float(np.polyfit(np.arange(len(logs)), logs.numpy(), 1)[0]))
+        exponents.append(_fit_growth(difference.square().mean((1, 2, 3)).sqrt()))
     return StressResult(fmean(exponents), "per window", limit_growth_per_window)
+
+
+def _fit_growth(rms: Float[Tensor, " windows"]) -> float:
+    """Return the growth exponent per window; 0 where all are below LEAST_RMS, NaN where one is."""
+    if rms.isnan().any():
+        return math.nan
+    if (rms <= LEAST_RMS).all():
+        return 0.0
+    logs = rms.clamp(min=LEAST_RMS).log()
+    return float(np.polyfit(np.arange(len(logs)), logs.numpy(), 1)[0])
 
 
 def measure_adversarial_gain(
@@ -173,7 +198,7 @@ def measure_adversarial_gain(
     curve = []
     for step in range(steps):
         extra = (extra * perturbation_rms / extra.square().mean().sqrt()).detach().requires_grad_()
-        change = (last_frame(extra) - plain).square().mean()
+        change = (last_frame(extra) - plain).square().mean() + 0 * extra.sum()  # 0: unused inputs
         (gradient,) = torch.autograd.grad(change, extra)
         curve.append((step, math.sqrt(float(change.detach())) / perturbation_rms))
         extra = gradient + 1e-12
@@ -202,7 +227,7 @@ def measure_bf16_psnr_difference(
 
 def count_settling_windows(scores: Float[Tensor, " windows"], within_db: float) -> float:
     """Return the first window from which on the scores, averaged over five windows, stay within
-    `within_db` of the mean of their second half.
+    `within_db` of the mean of their second half; inf where none of the first half does.
     """
     plateau = scores[len(scores) // 2 :].mean()
     smooth = scores.unfold(0, 5, 1).mean(1) if len(scores) >= 5 else scores
@@ -210,9 +235,11 @@ def count_settling_windows(scores: Float[Tensor, " windows"], within_db: float) 
 
 
 def count_windows_to_last_exceedance(losses: Float[Tensor, " windows"], limit: float) -> float:
-    """Return how many windows pass until `losses` is above `limit`, or NaN, for the last time."""
+    """Return how many windows pass until `losses` is above `limit`, or NaN, for the last time; inf
+    where the last one is."""
     beyond = (~(losses <= limit)).nonzero()
-    return float(beyond[-1] + 1) if len(beyond) else 0.0
+    last = int(beyond[-1]) + 1 if len(beyond) else 0
+    return math.inf if last == len(losses) else float(last)
 
 
 def _draw_normal(like: Tensor, name: str) -> Tensor:

@@ -37,9 +37,9 @@ class StressResult:
         return self.violates_limit(self.value)
 
     @property
-    def first_failure(self) -> Any:
-        """The first setting of the curve whose value is beyond the limit; None: there is none."""
-        return next((name for name, value in self.curve if self.violates_limit(value)), None)
+    def failing_settings(self) -> list[Any]:
+        """The settings of the curve whose values are beyond the limit."""
+        return [name for name, value in self.curve if self.violates_limit(value)]
 
 
 StressTest = Callable[[Candidate, StressBench], StressResult]
@@ -136,8 +136,8 @@ def _summarize_network(outcomes: Mapping[str, Outcome]) -> str:
 def _describe_failure(result: StressResult) -> str:
     side = "at least" if result.higher_is_better else "at most"
     text = f"{_format_with_unit(result)}, limit {side} {result.limit:g}"
-    where = result.first_failure
-    return text if where is None else f"{text}; fails from {result.varied} = {where} on"
+    where = ", ".join(map(str, result.failing_settings))
+    return f"{text}; fails at {result.varied} = {where}" if where else text
 
 
 def _format_with_unit(result: StressResult) -> str:

@@ -1,9 +1,9 @@
-"""Arguments that stress tests cannot run with, and those of the shipped configs."""
+"""Arguments that stress tests cannot run with, those of the shipped configs, and titles."""
 
 import pytest
 from omegaconf import OmegaConf
 
-from src.bench.stress_tests.arguments import check_arguments
+from src.bench.stress_tests.arguments import check_arguments, fill_title
 from tests.conftest import ROOT
 
 KEY = "stress_tests.any.test"
@@ -50,3 +50,20 @@ def test_the_shipped_tests_are_allowed():
             given = dict(node.test)
             check(given.pop("_target_").rpartition(".")[2], **given)
     check("any", rates_hz=[40, 6400], counts=[8], parameter="turbulence.baseline_m", fixed=None)
+
+
+def test_a_title_has_the_arguments_of_its_test():
+    given = {"windows": 500, "values": [30.0, 0.5, 10], "sizes": [[2, 3]], "none": []}
+    title = fill_title(
+        "", "{windows:,} and {values.least:g} to {values.most:g}, {values.last}", given
+    )
+    assert title == "500 and 0.5 to 30, 10"
+
+
+@pytest.mark.parametrize("title", ["{foo}", "{windows.most}", "{windows", "{}", "{sizes.most}"])
+def test_a_title_that_names_no_argument_is_refused(title):
+    given = {"windows": 500, "sizes": [[2, 3]]}
+    with pytest.raises(
+        ValueError, match=r"^stress_tests\.a\.title must name .* windows, sizes, got"
+    ):
+        fill_title("stress_tests.a.title", title, given)

@@ -13,6 +13,7 @@ from baselines.highpass import HighPass
 from src.bench.candidates import Candidate
 from src.bench.stress_tests import (
     conditions,
+    event_clips,
     faults,
     recurrence,
     static_camera,
@@ -111,7 +112,7 @@ def test_what_is_not_a_number_fails_wherever_it_stands():
         found = stress_results.build_worst_psnr_loss_result(curve, limit_db=1.0, varied="")
         assert found.failed and found.value != found.value
     scores = torch.full((60,), torch.nan)
-    assert recurrence.count_settling_windows(scores, 1.0) == 30
+    assert recurrence.count_settling_windows(scores, 1.0) == torch.inf
 
 
 def test_a_stress_clip_has_the_sensor_that_was_drawn():
@@ -123,9 +124,26 @@ def test_a_stress_clip_has_the_sensor_that_was_drawn():
     assert all(map(np.array_equal, found.events, plain.events))
 
 
-def test_nothing_known_is_a_failure_and_the_first_break_is_found():
-    found = StressResult(float("nan"), "dB", 1.0, [(1, 0.5), (2, 1.5), (3, 0.2)])
-    assert found.failed and found.first_failure == 2
+def test_nothing_known_is_a_failure_and_the_settings_that_fail_are_named():
+    found = StressResult(torch.nan, "dB", 1.0, [(1, 0.5), (2, 1.5), (3, 0.2), (4, 2)], "px")
+    assert found.failed and found.failing_settings == [2, 4]
+    text = stress_results.format_summary_per_network({"a": {"net": found}}, {"a": "a"}, {})
+    assert "limit at most 1; fails at px = 2, 4\n" in text
+
+
+def test_a_loss_is_against_the_best_of_the_reference_and_the_settings_before():
+    losses = event_clips.compute_losses_against_best(20.0, [(1, 21.0), (4, 23.0), (10, 20.5)])
+    assert losses == [(1, -1.0), (4, -2.0), (10, 2.5)]
+    unknown = event_clips.compute_losses_against_best(20.0, [(1, torch.nan), (4, 23.0)])
+    assert all(loss != loss for _, loss in unknown)
+
+
+def test_turbulence_that_helps_before_it_harms_costs_what_it_harms(bench, monkeypatch):
+    scores = {0.0: 20.0, 4: 23.0, 10: 20.5}
+    monkeypatch.setattr(bench, "mean_aligned_psnr", lambda _, given: scores[given.d_over_r0])
+    settings = {"parameter": "d_over_r0", "values": [4, 10], "reference": {"d_over_r0": 0.0}}
+    found = conditions.measure_worst_psnr_loss(running(), bench, limit_db=1.2, **settings)
+    assert found.value == 2.5 and found.failed
 
 
 @pytest.mark.parametrize(
@@ -185,6 +203,43 @@ def test_a_sum_holds_and_a_leaky_sum_does_not(bench):
     assert kept.curve[0][1] == pytest.approx(100 * 0.9**5, rel=0.02) and kept.failed
 
 
+class Pausing(Running):
+    """As Running; in a window without events, what `pause` makes of the last frame."""
+
+    def __init__(self, pause):
+        super().__init__()
+        self.pause = pause
+
+    def forward(self, voxels, state=None, **_):
+        frame, state = super().forward(voxels, state)
+        return (frame if voxels.any() else self.pause(frame)), state
+
+
+@pytest.mark.parametrize(
+    ("pause", "percent"),
+    [
+        (lambda frame: torch.rand(frame.shape), 0),
+        (lambda frame: 1 - frame, -100),
+        (lambda frame: 0.5 + 0.3 * (frame - 0.5), 30),
+        (lambda frame: frame + (frame - 0.5).std() * torch.randn(frame.shape), 71),
+        (lambda frame: torch.full_like(frame, 0.5), 0),
+    ],
+)
+def test_contrast_is_kept_where_the_picture_is(bench, pause, percent):
+    torch.manual_seed(0)
+    network = Candidate("pausing", Pausing(pause), 9)
+    network.loaded.gain.data /= 10  # within the range of frames
+    options = {"windows": [3], "limit_percent": 90.0}
+    found = recurrence.measure_contrast_retention_percent(network, bench, **options)
+    assert found.value == pytest.approx(percent, abs=5) and found.failed
+
+
+def test_contrast_of_frames_that_are_none_is_not_kept(bench):
+    network = Candidate("none", Pausing(lambda frame: torch.full_like(frame, torch.nan)), 9)
+    options = {"windows": [3], "limit_percent": 90.0}
+    assert recurrence.measure_contrast_retention_percent(network, bench, **options).failed
+
+
 @pytest.mark.parametrize("window_length", ["trained", "growing"])
 def test_windows_of_any_length_end_with_the_same_events(bench, window_length):
     clip, network, asked = bench.clips()[0], running(), [7, 15, 40, 45]
@@ -214,6 +269,41 @@ def test_the_worst_input_of_a_sum_is_found(bench):
     found = recurrence.measure_adversarial_gain(running(), bench, **sizes)
     # Five bins pull the same way; all that nine views may have goes into the one that is seen.
     assert found.value == pytest.approx(0.03 * 5 * 3, rel=1e-3)
+
+
+class Blind(EventToVideoNetwork):
+    """Half grey, whatever the events."""
+
+    views = None
+
+    def __init__(self):
+        super().__init__()
+        self.grey = nn.Parameter(torch.tensor(0.5))
+
+    def forward(self, voxels, state=None, **_):
+        size = voxels.shape[0], 1, *voxels.shape[-2:]
+        return self.grey.expand(size), voxels.new_zeros(1)
+
+
+def test_what_has_no_effect_neither_grows_nor_gains(bench):
+    blind = Candidate("blind", Blind(), 9)
+    growth = recurrence.measure_input_perturbation_growth(blind, bench, limit_growth_per_window=0.0)
+    gain = recurrence.measure_adversarial_gain(blind, bench, windows=3, steps=2, limit_gain=1.0)
+    assert growth.value == 0 and not growth.failed
+    assert gain.value == 0 and not gain.failed
+    blind.loaded.grey.requires_grad_(False)
+    assert recurrence.measure_adversarial_gain(blind, bench, windows=3, limit_gain=1.0).value == 0
+
+
+def test_frames_that_are_none_fail_every_test_of_the_state(bench):
+    network = Candidate("none", Blind(), 9)
+    network.loaded.grey.data.fill_(torch.nan)
+    for measure, limit in (
+        (recurrence.measure_convergence_windows, {"limit_windows": 1e9}),
+        (recurrence.measure_flicker_recovery, {"limit_windows": 1e9}),
+        (recurrence.measure_input_perturbation_growth, {"limit_growth_per_window": 1e9}),
+    ):
+        assert measure(network, bench, **limit).failed, measure
 
 
 def test_what_looks_at_the_centre_alone_minds_no_other_view(bench):
@@ -336,6 +426,10 @@ def test_settling_is_the_last_time_beyond():
     scores = torch.cat([torch.linspace(0, 20, 21), torch.full((39,), 20.0)])
     assert recurrence.count_settling_windows(scores, 1.0) == 18  # averaged over five windows
     assert recurrence.count_windows_to_last_exceedance(torch.tensor([3.0, 0.5, 2.0, 0.5]), 1.0) == 3
+    assert recurrence.count_settling_windows(torch.linspace(0, 20, 60), 1.0) == torch.inf
+    for last in (2.0, torch.nan):
+        losses = torch.tensor([3.0, 0.5, last])
+        assert recurrence.count_windows_to_last_exceedance(losses, 1.0) == torch.inf
 
 
 class Cloudy(Running):
