@@ -25,6 +25,8 @@ from scripts.p2s_training import TrainableNetwork
 from src.app.script import run_script
 from src.sim.turbulence.p2s import EDGE_MARGIN, FILE, basis_parities
 
+SAMPLES = 160_000  # of a band
+
 
 @dataclass(frozen=True)
 class BandPlan:
@@ -35,7 +37,6 @@ class BandPlan:
     rank: int
     fine: int
     sizes: tuple[tuple[int, int], ...]
-    samples: int = 160_000
 
 
 PLANS = (
@@ -72,8 +73,8 @@ def fit_bands(steps: int) -> dict[str, Tensor]:
 def fit_band(plan: BandPlan, steps: int) -> dict[str, Tensor]:
     """Return mean, basis and the layers of the networks of one band."""
     torch.manual_seed(int(1000 * plan.edge))
-    strength = plan.start + (EDGE_MARGIN * plan.edge - plan.start) * torch.rand(plan.samples, 1)
-    phase = draw_phase(plan.samples, strength)
+    strength = plan.start + (EDGE_MARGIN * plan.edge - plan.start) * torch.rand(SAMPLES, 1)
+    phase = draw_phase(SAMPLES, strength)
     some = exact_psfs(phase[:12_000], plan.fine)
     mean, basis, project = principal_basis(some, plan.rank)
     weights = torch.cat(
