@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 from omegaconf import OmegaConf
 
+from benchmarks.timing import RECORDING
 from src.app.instantiate import instantiate_node
 from src.app.script import positive_number, run_script, whole_number
 from src.bench.speed import build_grid_step
@@ -31,7 +32,6 @@ from src.recordings.files.recording import read_events
 
 FPS, EVENTS_PER_PIXEL, WINDOWS, WARMUP = 120, 0.1, 3, 2
 SLOW_MS = 8e3  # a frame: no further windows and forms are timed
-RECORDING = Path("../shared/data/events/gen3_640x480_evt2.raw")
 NETWORKS = Path(__file__).resolve().parents[1] / "conf" / "networks" / "published.yaml"
 OURS = ("setnet_small", "setnet_medium", "single256")
 SIZES = ("240x180", "346x260", "1280x720")

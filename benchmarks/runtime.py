@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.timing import RECORDING
 from src.app.script import positive_number, run_script, whole_number
 from src.bench.speed import FORM_DTYPES, build_grid_step, measure_peak_conv_macs_per_s
 from src.deploy.cost import count_macs, macs_per_frame, torch_threads
@@ -32,7 +33,6 @@ from src.sim.optics import layout
 
 SIDE, FPS, RATE = 176, 600, 5e6
 FORM = "bf16" if is_bf16_faster() else "float32"
-RECORDING = Path("../shared/data/events/gen3_640x480_evt2.raw")
 NAMES = ("setnet_small", "setnet_medium", "lf3x3")
 
 

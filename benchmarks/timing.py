@@ -1,7 +1,10 @@
-"""How a piece of work is timed: the least of several repeats, the first one not counted."""
+"""What is timed by default, and how: the least of several repeats, the first one not counted."""
 
 import time
 from collections.abc import Callable
+from pathlib import Path
+
+RECORDING = Path("../shared/data/events/gen3_640x480_evt2.raw")
 
 
 def least(work: Callable[[], object], clock=time.thread_time, repeats: int = 12) -> float:

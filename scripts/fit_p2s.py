@@ -27,6 +27,8 @@ from src.app.script import run_script
 from src.records.atomic import atomic_path, check_writable
 from src.sim.turbulence.p2s import EDGE_MARGIN, FILE, basis_parities, read_bands
 
+SAMPLES = 160_000  # of a band
+
 
 @dataclass(frozen=True)
 class BandPlan:
@@ -37,7 +39,6 @@ class BandPlan:
     rank: int
     fine: int
     sizes: tuple[tuple[int, int], ...]
-    samples: int = 160_000
 
 
 PLANS = (
@@ -75,8 +76,8 @@ def fit_bands(steps: int) -> dict[str, Tensor]:
 def fit_band(plan: BandPlan, steps: int) -> dict[str, Tensor]:
     """Return mean, basis and the layers of the networks of one band."""
     torch.manual_seed(int(1000 * plan.edge))
-    strength = plan.start + (EDGE_MARGIN * plan.edge - plan.start) * torch.rand(plan.samples, 1)
-    phase = draw_phase(plan.samples, strength)
+    strength = plan.start + (EDGE_MARGIN * plan.edge - plan.start) * torch.rand(SAMPLES, 1)
+    phase = draw_phase(SAMPLES, strength)
     some = exact_psfs(phase[:12_000], plan.fine)
     mean, basis, project = principal_basis(some, plan.rank)
     weights = torch.cat(

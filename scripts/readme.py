@@ -32,6 +32,7 @@ from src.metrics.bootstrap import bootstrap_interval
 from src.metrics.table import METRICS, Column
 from src.models import files
 from src.records import results
+from src.records.atomic import write_text
 from src.reports.writers import replace_section
 from src.sim.optics import layout
 from src.sim.pipeline import Sample, simulate
@@ -207,7 +208,7 @@ def update_card(card: Path, protocol: str, commit: str, clips: list[dict]) -> No
         lines[place] = row
     else:  # at the end of the table, a blank line before its note
         lines.insert(place - 1, row)
-    results.write_text(card, "\n".join(lines) + "\n")
+    write_text(card, "\n".join(lines) + "\n")
 
 
 def write_film(path: Path, index: int) -> None:

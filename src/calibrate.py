@@ -35,7 +35,7 @@ from src.recordings.files.recording import open_recording
 from src.recordings.files.turbulence_file import SIDE
 from src.recordings.views import Views, load_views
 from src.records import results
-from src.records.atomic import check_writable
+from src.records.atomic import check_writable, write_text
 
 MOST_LEFT_OUT = 0.05  # of a view, by another aspect, that is not worth a word
 Films = Float[np.ndarray, "views frames h w"]
@@ -255,7 +255,7 @@ def measure_turbulence_in_video(
     text += air.found.to_yaml()
     calibration_figures.draw_measured_turbulence(air, Path(video).name, run / "air.png")
     for path in filter(None, (run / "air.yaml", cfg.save)):
-        results.write_text(Path(path), text)
+        write_text(Path(path), text)
     return air
 
 

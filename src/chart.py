@@ -11,6 +11,7 @@ from src.bench import speed_accuracy
 from src.bench.speed import SpeedBenchmark
 from src.figures import frontier
 from src.records import results
+from src.records.atomic import write_text
 
 
 def draw_speed_accuracy_chart(cfg: DictConfig) -> dict[str, str]:
@@ -29,16 +30,16 @@ def draw_speed_accuracy_chart(cfg: DictConfig) -> dict[str, str]:
     results.create_run_folder(run, entry_point.resolved_yaml(cfg))
     benchmark = SpeedBenchmark(run, seconds=cfg.seconds, bins=cfg.bins)
     speeds = [row for candidate in candidates for row in benchmark.measure(candidate, *measured)]
-    results.write_text(run / "speed.csv", speed_accuracy.format_speeds_csv(speeds))
+    write_text(run / "speed.csv", speed_accuracy.format_speeds_csv(speeds))
     scores = speed_accuracy.score_accuracy(candidates, pipelines, cfg.clips, metrics, warmup=warmup)
-    results.write_text(run / "scores.csv", speed_accuracy.format_scores_csv(scores))
+    write_text(run / "scores.csv", speed_accuracy.format_scores_csv(scores))
     recommended = speed_accuracy.recommend_network_per_severity(speeds, scores, side)
     text = speed_accuracy.format_chart_summary(speeds, scores, recommended, side)
     title = "mean over " + ", ".join(cfg.severities) + " turbulence"
     for suffix in ("png", "svg"):
         path = run / f"chart.{suffix}"
         frontier.draw_accuracy_against_time(path, speeds, scores, side=side, title=title)
-    results.write_text(run / "chart.md", text)
+    write_text(run / "chart.md", text)
     rich.print(text)
     print(f"in {run}")
     return recommended

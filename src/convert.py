@@ -8,6 +8,7 @@ import numpy as np
 from omegaconf import DictConfig
 
 from src.app import entry_point
+from src.recordings.event_windows import check_time_range
 from src.recordings.files import event_writers, recording, recording_inputs
 from src.recordings.files.event_arrays import count_before
 from src.recordings.files.event_file import HeightWidth, ReadOptions
@@ -68,8 +69,7 @@ def cut_time_range(
     pieces: Iterable[np.ndarray], start_s: float, end_s: float
 ) -> Iterator[np.ndarray]:
     """Yield the events from `start_s` to `end_s`, seconds after the first of `pieces`."""
-    if not 0 <= start_s < end_s:
-        raise ValueError(f"start_s must be >= 0 and before end_s, got {start_s}, {end_s}")
+    check_time_range(start_s, end_s)
     first, count = None, 0
     for events in filter(len, pieces):
         first = int(events["t"][0]) if first is None else first

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from src.app import benchmark, build, entry_point, hardware, methods, simulation
+from src.app import build, entry_point, evreal_evaluation, hardware, methods, simulation
 from src.app.metrics import build_metrics
 from src.figures import samples
 from src.records import results
@@ -19,7 +19,7 @@ def evaluate(cfg: DictConfig) -> dict:
     Everything goes below `cfg.paths.run`.  Returns the content of `results.json`.
     """
     if cfg.data.get("benchmark") == "evreal":
-        return benchmark.evaluate_on_evreal(cfg)
+        return evreal_evaluation.evaluate_on_evreal(cfg)
     run, start = Path(cfg.paths.run), time.perf_counter()
     hardware.reserve_worker_cores(cfg)
     net = methods.load_method_with_postprocess(cfg)

@@ -11,6 +11,7 @@ from src.app import entry_point
 from src.app.instantiate import as_dict
 from src.app.path_overrides import unquote_override
 from src.records import results, runs
+from src.records.atomic import write_text
 from src.reports import page, run_groups, tables, writers
 from src.reports.differences import build_difference_table
 from src.reports.pairs import build_pair_table
@@ -50,8 +51,8 @@ def report(cfg: DictConfig) -> list[tables.Table]:
     commands = [plan.command for plan in plans]
     text = _format_text(made, commands, columns)
     results.create_run_folder(out, entry_point.resolved_yaml(cfg))
-    results.write_text(out / "report.md", text)
-    results.write_text(out / "report.csv", writers.format_csv_tables(made.shown))
+    write_text(out / "report.md", text)
+    write_text(out / "report.csv", writers.format_csv_tables(made.shown))
     html = page.format_html(
         title,
         made.shown,
@@ -61,7 +62,7 @@ def report(cfg: DictConfig) -> list[tables.Table]:
         folder=out,
         media_bytes=int(cfg.media_mib * 2**20),
     )
-    results.write_text(out / "report.html", html)
+    write_text(out / "report.html", html)
     if cfg.into:
         writers.replace_section(Path(cfg.into), title, text)
     print(f"{text}\nin {out}: report.md, report.csv, report.html")

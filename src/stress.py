@@ -20,6 +20,7 @@ from src.bench.stress_tests import arguments, stress_results
 from src.bench.stress_tests.event_clips import StressBench
 from src.figures.stress_map import draw_stress_map
 from src.records import results
+from src.records.atomic import write_text
 from src.training.worker_process import exit_with_parent
 
 NetworkResults = tuple[dict[str, stress_results.Outcome], float | None]
@@ -47,10 +48,10 @@ def stress(cfg: DictConfig) -> stress_results.Outcomes:
             outcomes[test][candidate.name] = outcome
         if psnr is not None:
             standard_psnr[candidate.name] = psnr
-        results.write_text(run / "stress.csv", stress_results.format_outcomes_csv(outcomes, titles))
+        write_text(run / "stress.csv", stress_results.format_outcomes_csv(outcomes, titles))
         print(f"{candidate.name} is done", flush=True)
     text = stress_results.format_summary_per_network(outcomes, titles, standard_psnr)
-    results.write_text(run / "stress.md", text)
+    write_text(run / "stress.md", text)
     for suffix in ("png", "svg"):
         draw_stress_map(run / f"stress.{suffix}", outcomes, titles, standard_psnr)
     rich.print(text)

@@ -319,7 +319,7 @@ def test_the_demo_is_recorded_where_it_is_played(tmp_path):
 def test_a_full_disk_is_told_before_the_work(tmp_path, monkeypatch):
     film = write_film(tmp_path / "my.mkv")
     cfg = config("simulate", tmp_path / "run", f"video={film}", *SMALL)
-    monkeypatch.setattr(user_clip_simulation, "FREE_BYTES", 1 << 60)
+    monkeypatch.setattr(user_clip_simulation, "CLIP_FREE_BYTES", 1 << 60)
     with pytest.raises(ValueError, match=r"write must have .* MiB free"):
         simulate(cfg)
     assert not list(tmp_path.rglob("my.raw*")) and not list(tmp_path.rglob("*.h5*"))

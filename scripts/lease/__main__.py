@@ -23,7 +23,7 @@ from pathlib import Path
 from src.app.script import run_script
 
 START = time.monotonic()  # before the imports below, which take seconds
-DEFAULT_OUT, MAX_FOLDER_MIB = "out/lease", 60
+DEFAULT_OUT = "out/lease"
 OPTIONS = {"join": (2, {"to"}), "folder": (3, {"scenes", "lpips"}), "check": (2, {"only"})}
 
 
@@ -46,7 +46,7 @@ def run_command(words: list[str], options: dict[str, str], minutes: float) -> in
         return int(bool(lost))
     if words[0] == "folder":
         given = {key: Path(path) for key, path in options.items()}
-        print(folder.gather_files(Path(words[1]), Path(words[2]), given, MAX_FOLDER_MIB))
+        print(folder.gather_files(Path(words[1]), Path(words[2]), given))
         return 0
     plan = load_plan(Path(words[-1]))
     if "only" in options:

@@ -11,12 +11,15 @@ from scripts.lease.selection import Selection, allot_seconds, overhead_s
 from src.metrics.lpips import BACKBONE_FOLDER
 from src.models import files
 
+MAX_FOLDER_MIB = 60
 
-def gather_files(folder: Path, plan: Path, given: Mapping[str, Path], max_mib: float) -> str:
+
+def gather_files(folder: Path, plan: Path, given: Mapping[str, Path]) -> str:
     """Copy `plan` and all files it names into `folder`, with `given` ones in their place; return a
     line that says what is there.
 
-    Raises ValueError where a file is missing or damaged, or they are more than `max_mib` together.
+    Raises ValueError where a file is missing or damaged, or they are more than MAX_FOLDER_MIB
+    together.
     """
     content = read_content(plan)
     names: dict[Path, str] = {}
@@ -34,9 +37,9 @@ def gather_files(folder: Path, plan: Path, given: Mapping[str, Path], max_mib: f
     if missing := [str(source) for source in names if not source.is_file()]:
         raise ValueError(f"{plan} names missing files: {', '.join(missing)}")
     size = sum(source.stat().st_size for source in names) / MIB
-    if size > max_mib:
+    if size > MAX_FOLDER_MIB:
         each = ", ".join(f"{source} {source.stat().st_size / MIB:.1f}" for source in names)
-        raise ValueError(f"folder must have at most {max_mib:g} MiB, got {size:.1f}: {each}")
+        raise ValueError(f"folder must have at most {MAX_FOLDER_MIB} MiB, got {size:.1f}: {each}")
     folder.mkdir(parents=True, exist_ok=True)
     for source, name in names.items():
         shutil.copyfile(source, folder / name)

@@ -13,12 +13,8 @@ from src.app import console
 from src.app.config_files import CONF, config_choices
 from src.app.config_values import check_values_like
 from src.app.path_overrides import quote_paths, refuse_empty_paths
-from src.app.renamed_keys import (
-    explain_refused_key,
-    flatten_keys,
-    read_override_key,
-    refuse_renamed_keys,
-)
+from src.app.renamed_keys import explain_refused_key, flatten_keys, refuse_renamed_keys
+from src.records.overrides import read_override_key
 
 
 def compose_config(name: str, *overrides: str) -> DictConfig:

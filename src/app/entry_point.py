@@ -31,11 +31,13 @@ from src.app.path_overrides import (
     refuse_empty_paths,
     unquote_override,
 )
-from src.app.renamed_keys import read_override_key, refuse_renamed_keys
+from src.app.renamed_keys import refuse_renamed_keys
 from src.app.stop_signals import StoppedBySignal, stop_by_signals
 from src.models import files
 from src.models.checkpoints import list_checkpoints
 from src.records import results
+from src.records.atomic import write_text
+from src.records.overrides import read_override_key
 from src.records.run_lock import hold_run_folder
 
 FAILURE_FILE = "failed.txt"  # in the folder of a sweep's job: why it failed
@@ -173,7 +175,7 @@ def run_job(
     except Exception as error:
         said = " ".join(console.cut_worker_traceback(str(error)).split())
         print(f"failed: {name}: {said}", file=sys.stderr)
-        results.write_text(folder / FAILURE_FILE, f"{name}\n{traceback.format_exc()}")
+        write_text(folder / FAILURE_FILE, f"{name}\n{traceback.format_exc()}")
     else:
         (folder / FAILURE_FILE).unlink(missing_ok=True)
         return

@@ -15,7 +15,6 @@ from torch import Tensor
 
 from src.app.compose import compose_checked_config
 from src.app.config_files import config_choices
-from src.app.renamed_keys import read_override_key
 from src.app.user_clip_simulation import (
     UserClipSimulation,
     read_user_clip,
@@ -23,13 +22,13 @@ from src.app.user_clip_simulation import (
     set_user_clip_sensor,
 )
 from src.recordings.files.event_arrays import concatenate_events, sort_events
+from src.recordings.files.event_file import EVENT
+from src.records.overrides import read_override_key
 from src.sim.optics import Position, view_id
 from src.sim.scenes import user_clip
 from src.sim.scenes.video_files import is_photograph
 
-VIEW_EVENT = np.dtype(
-    [("t", np.int64), ("x", np.uint16), ("y", np.uint16), ("p", np.int8), ("view", np.uint16)]
-)
+VIEW_EVENT = np.dtype([*EVENT.descr, ("view", np.uint16)])
 ARGUMENTS = (
     "turbulence", "sensor", "fps", "seconds", "start_s", "end_s", "longest_side_px", "seed",
 )  # fmt: skip

@@ -68,11 +68,6 @@ def _ask_for_nearest(name: str, names: Collection[str], start: int = 0) -> str:
     return f"; did you mean {name[:start]}{near[0]}?" if near else ""
 
 
-def read_override_key(override: str) -> str:
-    """Return the key, or the group, of `key=value`, `+key=value`, `~key`, `group@package=name`."""
-    return override.partition("=")[0].strip().lstrip("+~").partition("@")[0]
-
-
 def refuse_renamed_keys(cfg: DictConfig) -> None:
     """Raise ValueError for a former key in `cfg`, such as one of a user's config file, or one added
     by `+`; arguments of classes of other packages have any names.

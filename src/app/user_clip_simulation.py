@@ -16,9 +16,9 @@ from omegaconf import DictConfig, open_dict
 from torch import Tensor
 
 from src.app.instantiate import build_part
-from src.app.renamed_keys import read_override_key
 from src.app.simulation import build_sensor, check_noise_rates, decodes_srgb
-from src.recordings.simulated_recording import Progress
+from src.recordings.simulated_recording import Progress, no_progress
+from src.records.overrides import read_override_key
 from src.sim import noise
 from src.sim.optics import Optics
 from src.sim.scenes import user_clip
@@ -29,7 +29,7 @@ from src.sim.turbulence.contract import ClipTurbulence, describe_clip_turbulence
 from src.sim.turbulence.operator import Turbulence
 
 PART_BYTES = 1 << 27  # of all views at a time
-FREE_BYTES = 1 << 28  # that are left on the disk
+CLIP_FREE_BYTES = 1 << 28  # that are left on the disk
 KEYS_OF_SCENES = ("scene", "data", "bins", "split")
 
 
@@ -99,7 +99,7 @@ class UserClipSimulation:
         )
 
     def simulate_parts(
-        self, views: Float[Tensor, "views frames h w"], progress: Progress = lambda parts, _: parts
+        self, views: Float[Tensor, "views frames h w"], progress: Progress[int] = no_progress
     ) -> Iterator[SimulatedPart]:
         """Yield the clip part by part, and write what all views see, light, to `views`."""
         count = self.simulated_frame_count
@@ -137,7 +137,7 @@ class UserClipSimulation:
         longer used.  Raises ValueError where the disk has no room for it and for what comes.
         """
         shape = (self.optics.views, self.simulated_frame_count, *self.clip.size)
-        needed = 2 * math.prod(shape) + FREE_BYTES
+        needed = 2 * math.prod(shape) + CLIP_FREE_BYTES
         needed += 2 * math.prod(shape) // self.substeps  # of the truth, at most about
         free = shutil.disk_usage(folder).free
         if free < needed:

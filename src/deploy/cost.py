@@ -13,6 +13,7 @@ from src.models.network import EventToVideoNetwork
 from src.sim.optics import Position
 
 MAX_FRAMES = 200  # timed at most
+TIMED_FRAMES = 5  # by `time_frame`
 LONG_S = 0.1  # a window in which everything is due
 
 
@@ -108,10 +109,9 @@ def time_frame(
     *,
     positions: Sequence[Position] | None = None,
     threads: int = 1,
-    seconds: float = 1.0,
-    min_frames: int = 3,
 ) -> Timing:
-    """Return the time of one window (n, views, bins, h, w), state carried, as `time_calls` does.
+    """Return the time of one window (n, views, bins, h, w), state carried, as `time_calls` does, of
+    TIMED_FRAMES.
 
     `positions`: (row, col) of each view, None: `optics.layout`.
     """
@@ -122,5 +122,5 @@ def time_frame(
         _, state = network(voxels, state, positions=positions)
 
     return time_calls(
-        advance, threads=threads, device=voxels.device, seconds=seconds, min_calls=min_frames
+        advance, threads=threads, device=voxels.device, seconds=0.0, min_calls=TIMED_FRAMES
     )

@@ -108,7 +108,7 @@ class DecoderLayers(nn.Module):
     def __init__(self, network: SetNet, dtype: torch.dtype, is_whole: bool = False):
         super().__init__()
         assert isinstance(network.pixel_conv, EqualDCConv)
-        self.pixel_conv = TwoByTwoCellConv(network.pixel_conv, CELL_PX).to(dtype)
+        self.pixel_conv = TwoByTwoCellConv(network.pixel_conv).to(dtype)
         conv = deepcopy(network.decoder_conv) if is_whole else unpadded(network.decoder_conv)
         self.decoder_conv, self.dtype = conv.to(dtype), dtype
 
@@ -157,19 +157,19 @@ class WholeWindow(nn.Module):
 
 
 class TwoByTwoCellConv(nn.Module):
-    """An EqualDCConv that gives the pixels of 2 x 2 cells of `side` pixels at once, row by row: as
+    """An EqualDCConv that gives the pixels of 2 x 2 cells of CELL_PX pixels at once, row by row: as
     few outputs as those of one cell leave most of a processor's registers empty.
     """
 
-    def __init__(self, conv: EqualDCConv, side: int):
+    def __init__(self, conv: EqualDCConv):
         super().__init__()
         kernels, bias = (part.detach() for part in conv.equalised())
-        width = 2 * side  # of 2 x 2 cells, in pixels
+        width = 2 * CELL_PX  # of 2 x 2 cells, in pixels
         _, channels, size, _ = kernels.shape
         weight = kernels.new_zeros(width, width, channels, size + 1, size + 1)
         for row, column in np.ndindex(width, width):
-            (down, a), (right, b) = divmod(row, side), divmod(column, side)
-            kernel = kernels[side * a + b]
+            (down, a), (right, b) = divmod(row, CELL_PX), divmod(column, CELL_PX)
+            kernel = kernels[CELL_PX * a + b]
             weight[row, column, :, down : down + size, right : right + size] = kernel
         self.weight = nn.Parameter(weight.flatten(0, 1))
         self.bias = nn.Parameter(bias[0].repeat(width**2))

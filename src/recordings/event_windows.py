@@ -98,10 +98,7 @@ class WindowRule:
             raise ValueError(f"bins must be >= 1, got {self.bins}")
         if self.noise_filter_s is not None:
             check_noise_filter_s(self.noise_filter_s)
-        if not 0 <= self.start_s < self.end_s:
-            raise ValueError(
-                f"start_s must be >= 0 and before end_s, got {self.start_s}, {self.end_s}"
-            )
+        check_time_range(self.start_s, self.end_s)
 
     @property
     def overlapping_windows(self) -> int:
@@ -118,6 +115,14 @@ class WindowRule:
         """Return whether a network keeps the state after this window."""
         frames = round((end_us - start_us) * 1e-6 * self.fps)
         return not self.grows or frames >= self.frames_per_window
+
+
+def check_time_range(start_s: float, end_s: float, node: str = "") -> None:
+    """Raise ValueError unless 0 <= `start_s` < `end_s`, in seconds; `node`: what their config keys
+    begin with, such as `data.`."""
+    if not 0 <= start_s < end_s:
+        wanted = f"{node}start_s must be >= 0 and before {node}end_s"
+        raise ValueError(f"{wanted}, got {start_s}, {end_s}")
 
 
 def build_window_rule(window_length: str, **settings: Any) -> WindowRule:

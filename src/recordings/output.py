@@ -24,7 +24,7 @@ from PIL import GifImagePlugin, Image
 
 from src.recordings.files.event_file import HeightWidth
 from src.recordings.reconstruction import Frame
-from src.records.atomic import check_free_space, name_path_in_errors, partial_path
+from src.records.atomic import atomic_path, check_free_space, name_path_in_errors, partial_path
 from src.sim.checks import check_in_range
 from src.sim.user_values import read_array, read_path
 
@@ -108,9 +108,8 @@ def write_video(path: Path | str, frames: Iterable[np.ndarray], fps: float) -> i
     if first is None or first.ndim not in (2, 3) or first.shape[2:] not in ((), (3,)):
         shape = "none" if first is None else first.shape
         raise ValueError(f"frames must be of shape (h, w) or (h, w, 3), got {shape}")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial, count = partial_path(path), 0
-    try:
+    count = 0
+    with atomic_path(path) as partial:
         with _mp4(partial, first.shape[:2], fps) as add:
             for frame in chain([first], given):
                 if frame.shape != first.shape:
@@ -119,9 +118,6 @@ def write_video(path: Path | str, frames: Iterable[np.ndarray], fps: float) -> i
                 add(round_to_uint8(frame), None)
                 count += 1
         _check_mp4(partial, count)
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
     return count
 
 
@@ -138,6 +134,12 @@ def round_to_uint8(picture: np.ndarray) -> UInt8[np.ndarray, "*shape"]:
     if picture.dtype == np.uint8:
         return picture
     return (np.clip(picture, 0, 1) * 255 + 0.5).astype(np.uint8)
+
+
+def write_png(path: Path, picture: Picture) -> None:
+    """Write a picture as a PNG; raises OSError where that fails, as on a full disk."""
+    if not cv2.imwrite(str(path), picture):
+        raise OSError(f"{path} cannot be written; is the disk full?")
 
 
 def resize_picture(
@@ -169,7 +171,7 @@ def _check_mp4(path: Path, written: int) -> None:
 @contextmanager
 def _mp4(path: Path, size: HeightWidth, fps: float) -> Iterator[Add]:
     rate = Fraction(fps).limit_denominator(1001)
-    with av.open(str(path), "w") as file:
+    with av.open(str(path), "w", format="mp4") as file:
         stream = file.add_stream("libvpx-vp9", rate=rate, options=VP9)  # browsers and OpenCV know
         stream.height, stream.width = size  # odd ones too
         stream.pix_fmt = "yuv420p"
@@ -221,9 +223,7 @@ def _png(path: Path, size: HeightWidth, fps: float) -> Iterator[Add]:
     names = (path / f"{number:07d}.png" for number in count())
 
     def add(picture: Picture, frame: Frame | None) -> None:
-        name = next(names)
-        if not cv2.imwrite(str(name), picture):
-            raise OSError(f"{name} cannot be written; is the disk full?")
+        write_png(next(names), picture)
 
     yield add
 

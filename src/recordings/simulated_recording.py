@@ -1,8 +1,9 @@
 """A simulated recording: nine mirrored, misaligned, vignetted views on one event sensor."""
 
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -18,11 +19,17 @@ from src.sim import noise
 from src.sim.optics import view_id
 from src.sim.sensor.sensor import EventSensor
 
-Progress = Callable[[range, str], Iterable[int]]
+Part = TypeVar("Part")
+Progress = Callable[[Sequence[Part], str], Iterable[Part]]
 BAND_BYTES = 1 << 28  # of sensor frames at a time
 FALLOFF = 0.5  # of light, from the middle of a view to that of an edge
 FILLED = 23 / 24  # of the sensor, by the tiles; the rest is for their displacements
 DARK = 0.02  # share of light that a sensor pixel gets without any
+
+
+def no_progress(parts: Sequence[Part], name: str) -> Iterable[Part]:
+    """Return `parts` as they are: the `progress` of work of which none is shown."""
+    return parts
 
 
 def kaleidoscope_views(
@@ -110,7 +117,7 @@ def _sample(
 
 def record_events(
     frames: Float[Tensor, "views frames h w"], fps: float, views: Views, sensor: EventSensor,
-    progress: Progress = lambda parts, _: parts, *, key: int = 0,
+    progress: Progress[int] = no_progress, *, key: int = 0,
 ) -> np.ndarray:  # fmt: skip
     """Return the sensor's events (t x y p) in order of time; `frames` are intensities in [0, 1], of
     16 or 32 bits, also on a disk (np.memmap).  The noise follows from `key`.
@@ -136,7 +143,7 @@ def record_events(
 
 def write_recording(
     path: Path | str, frames: Float[Tensor, "views frames h w"], fps: float, views: Views,
-    sensor: EventSensor, progress: Progress = lambda parts, _: parts, *, key: int = 0,
+    sensor: EventSensor, progress: Progress[int] = no_progress, *, key: int = 0,
 ) -> np.ndarray:  # fmt: skip
     """Record `frames` as `record_events`, write the events as an event file and return them.
 

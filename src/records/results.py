@@ -28,7 +28,7 @@ from src.records.atomic import partial_path, write_text
 
 SCHEMA = 1
 CONFIG_FILE = "config.yaml"
-LEAST_FREE_BYTES = 200 * 2**20
+RUN_FREE_BYTES = 200 * 2**20  # that the disk of a new run must have free
 
 
 @dataclass(frozen=True)
@@ -82,8 +82,8 @@ def create_run_folder(run: Path, config: str, name: str = CONFIG_FILE) -> None:
     except OSError as error:
         raise ValueError(f"paths.out must be a folder to write to, got {run}: {error}") from error
     free = shutil.disk_usage(run).free
-    if free < LEAST_FREE_BYTES:
-        needed, got = LEAST_FREE_BYTES >> 20, free >> 20
+    if free < RUN_FREE_BYTES:
+        needed, got = RUN_FREE_BYTES >> 20, free >> 20
         raise ValueError(f"paths.out must have {needed} MiB free, got {got} MiB at {run}")
     has_results(run, config)
     write_text(run / name, config)

@@ -9,6 +9,7 @@ from typing import Any
 import yaml
 
 from src.records import safe_yaml
+from src.records.overrides import read_override_key
 from src.records.runs import Run, SweepPlan, is_result_setting
 from src.reports.clip_conditions import format_setting, list_settings, list_test_conditions
 
@@ -62,7 +63,7 @@ def group_runs(
     `across` do not part groups, such as ckpt for networks of several seeds tested on the same
     clips.  Of two runs with one setting and the same seeds the newer counts.
     """
-    overridden = sorted({_override_key(override) for run in runs for override in run.overrides})
+    overridden = sorted({read_override_key(override) for run in runs for override in run.overrides})
     rows = [_label_values(run, overridden, across) for run in runs]
     keys = _distinguishing_keys(rows, overridden, _find_planned_keys(runs, plans, across))
     groups: dict[tuple[str, ...], RunGroup] = {}
@@ -136,10 +137,6 @@ def _place(key: str) -> int:
     return FIRST_KEYS.index(key) if key in FIRST_KEYS else len(FIRST_KEYS)
 
 
-def _override_key(override: str) -> str:
-    return override.split("=")[0].lstrip("+~").split("@")[0]
-
-
 def _override_value(override: str) -> str:
     """Return the value as `format_setting` writes it."""
     text = override.split("=", 1)[-1]
@@ -173,7 +170,7 @@ def _find_planned_keys(
     jobs = [job for plan in plans for job in plan.jobs]
     if {frozenset(job) for job in jobs} <= {frozenset(run.overrides) for run in runs}:
         return set()
-    values = [{_override_key(one): _override_value(one) for one in job} for job in jobs]
+    values = [{read_override_key(one): _override_value(one) for one in job} for job in jobs]
     keys = {key for job in values for key in job if len({one.get(key) for one in values}) > 1}
     train = any(run.record["task"] == "train" for run in runs)
     return {key for key in keys if key not in across and is_result_setting(key, train)}
@@ -207,7 +204,7 @@ def _count_missing(
     by_setting = {_without_seed(run.overrides): group for group in groups for run in group.runs}
     ordered: dict[int, RunGroup] = {}
     for job in (job for plan in plans for job in plan.jobs):
-        values = {_override_key(override): _override_value(override) for override in job}
+        values = {read_override_key(override): _override_value(override) for override in job}
         new = RunGroup(tuple(values.get(key, "-") for key in keys), [])
         group = by_setting.setdefault(_without_seed(job), new)
         group.missing += frozenset(job) not in done
@@ -216,4 +213,4 @@ def _count_missing(
 
 
 def _without_seed(overrides: Sequence[str]) -> frozenset[str]:
-    return frozenset(override for override in overrides if _override_key(override) != "seed")
+    return frozenset(override for override in overrides if read_override_key(override) != "seed")

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from src.metrics.table import Column
 from src.records import results
+from src.records.atomic import write_text
 from src.reports.tables import Table, TableCell
 
 
@@ -53,7 +54,7 @@ def replace_section(document: Path, name: str, text: str) -> None:
     """
     start, end = _markers(name)
     before, after = split_at_section(document, name)
-    results.write_text(document, f"{before}{start}\n\n{text.strip()}\n\n{end}{after}")
+    write_text(document, f"{before}{start}\n\n{text.strip()}\n\n{end}{after}")
 
 
 def split_at_section(document: Path, name: str) -> tuple[str, str]:

@@ -169,13 +169,10 @@ def _fill_caches(caches: Sequence[DiskClipCache]) -> None:
                 print(f"filling stops: {error}", file=sys.stderr)
 
 
-def hash_simulation_code() -> str:
-    """Return a hash of the code and tables that make clips: comments and layout do not count."""
-    return _hash_simulation_code(MEASURED)
-
-
 @functools.cache
-def _hash_simulation_code(measured: str) -> str:
+def hash_simulation_code(measured: str = MEASURED) -> str:
+    """Return a hash of the code and tables that make clips: comments and layout do not count.
+    `measured`: the file in src that draws turbulence=measured."""
     home, digest = Path(src.sim.__file__).parent, hashlib.sha256()
     digest.update(_hash_input(home.parent / measured))
     for path in sorted(home.rglob("*")):

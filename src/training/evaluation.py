@@ -75,8 +75,5 @@ def measure_frame_macs_and_ms(
     `window`, on its device."""
     views, bins, height, width = window.shape[1:]
     macs = macs_per_frame(network, height, width, views=views, bins=bins, positions=positions)
-    timing = time_frame(
-        network, window, positions=positions, threads=torch.get_num_threads(), seconds=0.0,
-        min_frames=5,
-    )  # fmt: skip
+    timing = time_frame(network, window, positions=positions, threads=torch.get_num_threads())
     return macs, timing.least_ms

@@ -11,10 +11,10 @@ from baselines.highpass import HighPass
 from src.models.network import EventToVideoNetwork
 from src.recordings import event_windows, reconstruction, sensor_lookup, views
 from src.recordings.event_windows import WindowRule, build_window_rule
+from src.recordings.files.event_file import EVENT
 from src.recordings.reconstruction import ReconstructionState, reconstruct_frames
 from src.sim.optics import layout
 
-EVENT = np.dtype([("t", np.int64), ("x", np.uint16), ("y", np.uint16), ("p", np.int8)])
 SIZE = (12, 16)
 TABLE = sensor_lookup.build_lookup(views.Views.single_view(SIZE, SIZE))
 

@@ -2,6 +2,7 @@
 
 import csv
 import inspect
+import os
 
 import cv2
 import h5py
@@ -156,6 +157,17 @@ def test_values_that_are_no_code_values_are_refused(frame, tmp_path):
     with pytest.raises(ValueError, match=r"frames must be uint8 or floats in \[-0.5, 1.5\], got"):
         write_video(tmp_path / "a.mp4", [frame], 30)
     assert not (tmp_path / "a.mp4").exists()
+
+
+def test_two_processes_that_write_one_video_keep_apart(tmp_path):
+    names = []
+
+    def pictures():
+        yield np.zeros(SIZE)
+        names.extend(path.name for path in tmp_path.iterdir())
+
+    write_video(tmp_path / "a.mp4", pictures(), 30)
+    assert len(names) == 1 and f".{os.getpid()}." in names[0]
 
 
 def test_what_no_video_can_be_written_of_is_named(tmp_path):

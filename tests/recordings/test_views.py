@@ -11,6 +11,7 @@ from src.recordings import sensor_lookup, simulated_recording, views
 from src.recordings.calibration import view_alignment
 from src.recordings.calibration.boards import Charuco, Checkerboard, Circles
 from src.recordings.corner_fold import CornerFold
+from src.recordings.files.event_file import EVENT
 from src.sim.optics import layout
 from src.sim.voxel import voxel_grid
 from tests.recordings import pictures
@@ -22,7 +23,6 @@ TARGETS = {
     "circles": (Circles(5, 7), pictures.circles(5, 7)),
     "charuco": (Charuco(6, 6), pictures.charuco()),
 }
-EVENT = np.dtype([("t", np.int64), ("x", np.uint16), ("y", np.uint16), ("p", np.int8)])
 
 
 @pytest.fixture(scope="module")

@@ -425,10 +425,8 @@ def test_files_in_linked_folders_are_in_the_hash_hidden_ones_are_not(tmp_path):
     assert hashes[0] == hashes[1] != hashes[2]
 
 
-def test_the_file_that_draws_measured_turbulence_is_in_the_hash(monkeypatch):
-    before = hash_simulation_code()
-    monkeypatch.setattr(disk_caches, "MEASURED", "recordings/files/time_unit.py")
-    assert hash_simulation_code() != before
+def test_the_file_that_draws_measured_turbulence_is_in_the_hash():
+    assert hash_simulation_code("recordings/files/time_unit.py") != hash_simulation_code()
 
 
 def test_code_is_hashed_once_a_process(monkeypatch):

@@ -19,6 +19,7 @@ from src.sim.scenes.video_files import PICTURE_SUFFIXES
 WINDOWS = 16
 LINES = 160  # at least so many along the longer side of pictures that are shrunk
 FIRST_WINDOW_US = 5000
+FINE_SIGMA_PX = 1.2  # of `band_pass_log`
 MIN_CONTRAST = 0.05  # of the window with the largest; windows of noise have less
 Pictures = Float[np.ndarray, "windows kinds h w"]
 
@@ -67,15 +68,16 @@ def shrink_pictures(
 
 
 def band_pass_log(
-    pictures: Float[np.ndarray, "n h w"], fine_sigma_px: float, coarse_sigma_px: float
+    pictures: Float[np.ndarray, "n h w"], coarse_sigma_px: float
 ) -> Float[np.ndarray, "n h w"]:
-    """Return the logarithm of pictures between two scales, sigmas of Gaussians; a pixel far above
-    its neighbours, a hot one, counts as three times their median."""
+    """Return the logarithm of pictures between two scales, FINE_SIGMA_PX and `coarse_sigma_px`,
+    sigmas of Gaussians; a pixel far above its neighbours, a hot one, counts as three times their
+    median."""
     bands = []
     for picture in pictures:
         capped = np.log1p(np.minimum(picture, 3 + 3 * cv2.medianBlur(picture, 5)))
         fine, coarse = (
-            cv2.GaussianBlur(capped, (0, 0), s) for s in (fine_sigma_px, coarse_sigma_px)
+            cv2.GaussianBlur(capped, (0, 0), s) for s in (FINE_SIGMA_PX, coarse_sigma_px)
         )
         bands.append(fine - coarse)
     return np.stack(bands)
@@ -86,7 +88,7 @@ def extract_coarse_edges(
 ) -> tuple[Float[np.ndarray, "n small_h small_w"], int]:
     """Return the edges of pictures shrunk to LINES or more, and the factor in pixels."""
     factor = max(1, max(pictures.shape[-2:]) // LINES)
-    return band_pass_log(shrink_pictures(pictures, factor), 1.2, 2.5), factor
+    return band_pass_log(shrink_pictures(pictures, factor), 2.5), factor
 
 
 def measure_squared_contrast(

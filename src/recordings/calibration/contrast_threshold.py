@@ -7,7 +7,7 @@ per pixel of the sensor, not of the warped view, per second, ON and OFF apart.
 """
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,7 +17,9 @@ from jaxtyping import Float, Int
 from scipy.ndimage import median_filter
 from torch import Tensor
 
-from src.records.results import format_csv, write_text
+from src.recordings.simulated_recording import Progress, no_progress
+from src.records.atomic import write_text
+from src.records.results import format_csv
 from src.sim.sensor.sensor import EventSensor, Sensor
 
 HOT_FACTOR = 5.0  # times its neighbours' median plus its view's mean: more than texture makes
@@ -183,7 +185,7 @@ def simulate_event_rates(
 def estimate_contrast_threshold(
     rates: EventRates, clips: Sequence[Clip], fps: float, sensor: Sensor,
     thresholds: Sequence[float] = GRID,
-    progress: Callable[[Sequence[Clip], str], Iterable[Clip]] = lambda clips, _: clips,
+    progress: Progress[Clip] = no_progress,
 ) -> ThresholdEstimate:  # fmt: skip
     """Return the thresholds at which the sensor makes the recording's rates.
 
@@ -240,7 +242,7 @@ class _Round:
 
 def _find_off_ratio(
     measured: np.ndarray, clips: Sequence[Clip], fps: float, sensor: Sensor,
-    thresholds: Sequence[float], progress: Callable[[Sequence[Clip], str], Iterable[Clip]],
+    thresholds: Sequence[float], progress: Progress[Clip],
 ) -> tuple[_Round, _Round]:  # fmt: skip
     """Return the round whose OFF ratio makes the quotient of the rates, by the secant method, and
     the one nearest to it, for slopes.  Raises ValueError where no ratio makes the rates."""

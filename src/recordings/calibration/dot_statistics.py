@@ -19,7 +19,8 @@ from src.recordings.calibration.boards import Circles
 from src.recordings.calibration.gaussian_dots import GaussianFits
 from src.recordings.calibration.tilt_covariance import find_first_fall
 from src.recordings.calibration.view_alignment import repair_picture
-from src.records.results import format_csv, write_text
+from src.records.atomic import write_text
+from src.records.results import format_csv
 
 
 @dataclass(frozen=True)

@@ -58,7 +58,7 @@ class PatchMatcher:
         self._kinds = pictures.shape[1]
         groups = np.array_split(pictures, min(GROUPS, len(pictures)))
         joined = [shrink_pictures(group.sum(0), scale) for group in groups]
-        structure = [band_pass_log(each, 1.2, 8.0) for each in joined]
+        structure = [band_pass_log(each, 8.0) for each in joined]
         self._stacks = structure if match_groups_apart else [np.concatenate(structure)]
         self._scale, self._middle = scale, (scale - 1) / 2
         edges = np.array(tile) / scale

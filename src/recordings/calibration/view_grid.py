@@ -20,7 +20,7 @@ from src.sim.optics import Position
 MIN_SCORE = 0.2  # of the energy that neighbours share; other scenes have 0.1 at most
 MIN_LIKENESS = 0.2  # of a view and its neighbour, 1 for equal ones
 SEAM_LIKENESS = 0.5  # of what lies before a seam and behind it; other lines have 0.3
-MIN_PITCH, MAX_VIEWS = 24, 10  # px, and along an axis
+MAX_VIEWS = 10  # along an axis
 WHOLE = 0.9  # share of a view that must lie on the sensor, or it is left out
 OTHER_GRIDS = "a grid turned by more than a degree or views of unequal size"
 Gram = Float[np.ndarray, "n n"]

@@ -3,7 +3,9 @@
 import numpy as np
 from numba import njit
 
-LONG_AGO_US = -(2**62)
+MAX_TIME_US = 2**62
+LONG_AGO_US = -MAX_TIME_US
+MAX_COORDINATE = 65535  # x and y have 16 bits
 KEPT, DROPPED, RIVAL, RETURNED, NEITHER = range(5)  # labels; the last three are not final
 LONGEST_SILENCE_US = 3_600_000_000  # events later by more are of another clock
 LAST_GAP_US = 1_000_000  # a few last events later by more, and by LAST_GAP times the file, too
@@ -23,14 +25,14 @@ def copy_events_on_sensor(t, x, y, p, width, height, largest_xy, out):
     most_x, most_y = largest_xy[0], largest_xy[1]
     for i in range(t.size):
         now, column, row, sign = t[i], np.int64(x[i]), np.int64(y[i]), p[i]
-        if sign < -1 or sign > 1 or now <= LONG_AGO_US or now >= -LONG_AGO_US:
+        if sign < -1 or sign > 1 or now <= LONG_AGO_US or now >= MAX_TIME_US:
             return kept, outside, i
         most_x, most_y = max(most_x, column), max(most_y, row)
         if width > 0:
             if not (0 <= column < width and 0 <= row < height):
                 outside += 1
                 continue
-        elif not (0 <= column < 65536 and 0 <= row < 65536):
+        elif not (0 <= column <= MAX_COORDINATE and 0 <= row <= MAX_COORDINATE):
             return kept, outside, i
         out[kept].t, out[kept].x, out[kept].y = now, column, row
         out[kept].p = 1 if sign > 0 else -1

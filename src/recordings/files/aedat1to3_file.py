@@ -15,7 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from src.recordings.files.clocks import TimestampUnwrapper, merge_small_pieces, read_whole_words
+from src.recordings.files.blocks import merge_small_pieces, read_whole_words
+from src.recordings.files.clocks import TimestampUnwrapper
 from src.recordings.files.event_file import (
     EventFile,
     EventStream,

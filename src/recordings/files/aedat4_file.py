@@ -17,7 +17,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from src.recordings.files.clocks import merge_small_pieces
+from src.recordings.files.blocks import merge_small_pieces
 from src.recordings.files.event_file import (
     EventFile,
     EventStream,

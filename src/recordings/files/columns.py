@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from src.recordings.engines.event_passes import MAX_COORDINATE
 from src.recordings.files.event_file import ReadOptions
 
 MAX_PACKING = 200  # most that the columns of a recording shrink when they are packed
-MAX_COORDINATE = 65535
 IN_ORDER = 0.99  # of the steps of a column that time may be
 DATES = "mM"  # the kinds of NumPy's timedelta64 and datetime64
 NAMES = {

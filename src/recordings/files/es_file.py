@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from src.recordings.engines.es_bytes import LONE_ATIS, LONE_DVS, count_events
-from src.recordings.files.clocks import find_end_before_zeros, read_whole_words
+from src.recordings.files.blocks import find_end_before_zeros, read_whole_words
 from src.recordings.files.event_file import EventFile, RawEvents, ReadOptions, name_file_in_errors
 
 HEADER_BYTES, KIND_AT, ATIS = 20, 15, 2

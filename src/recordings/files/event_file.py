@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 EVENT = np.dtype([("t", np.int64), ("x", np.uint16), ("y", np.uint16), ("p", np.int8)])
-TIME_UNITS = ("auto", "s", "ms", "us", "ns")
+UNITS_US = {"s": 1e6, "ms": 1e3, "us": 1.0, "ns": 1e-3}
+TIME_UNITS = ("auto", *UNITS_US)
 RAW_FORMATS = ("evt2", "evt21", "evt3")
 PIECE_EVENTS = 2**18  # events in a piece
 HeightWidth = tuple[int, int]

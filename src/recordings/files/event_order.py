@@ -19,6 +19,7 @@ from src.recordings.engines.event_passes import (
     KEPT,
     LONG_AGO_US,
     LONGEST_SILENCE_US,
+    MAX_TIME_US,
     label_kept_or_dropped,
 )
 from src.recordings.files.event_arrays import (
@@ -109,7 +110,7 @@ class EventSorter:
         if self._held and (cut := count_before(self._held[0], until_us)):
             ready.append(self._held[0][:cut])
             self._held[0] = self._held[0][cut:]
-        self._released_us = max(self._released_us, math.ceil(min(until_us, 2**62)))
+        self._released_us = max(self._released_us, math.ceil(min(until_us, MAX_TIME_US)))
         return ready
 
     def _decide(self, events: np.ndarray, least: int, *, at_end: bool) -> list[np.ndarray]:

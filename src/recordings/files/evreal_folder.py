@@ -25,7 +25,7 @@ from src.recordings.files.event_file import (
     name_file_in_errors,
 )
 from src.recordings.files.frame_files import wrap_frame_array
-from src.recordings.files.numpy_file import slice_columns, slice_times
+from src.recordings.files.lazy_columns import slice_columns, slice_times
 
 EVENT_FILES = ("events_ts.npy", "events_xy.npy", "events_p.npy")
 FRAME_FILES = ("images.npy", "images_ts.npy", "image_event_indices.npy")

@@ -42,7 +42,7 @@ def find_timelens_frames(events_folder: Path) -> RawFrames | None:
     found = [p for name in PICTURE_FOLDERS if (p := events_folder.parent / name).is_dir()]
     if not found:
         return None
-    names = sort_naturally(p for p in found[0].iterdir() if p.suffix.lower() in PICTURE_SUFFIXES)
+    names = list_pictures(found[0])
     places = [place / name for place in (found[0], events_folder.parent) for name in TIME_FILES]
     listing = next((place for place in places if place.is_file()), None)
     if listing is None:
@@ -57,6 +57,12 @@ def find_timelens_frames(events_folder: Path) -> RawFrames | None:
     if times.shape != (len(names),):
         raise ValueError(f"{listing} has {times.size} times for {len(names)} pictures")
     return _pictures(names, times, None)
+
+
+def list_pictures(folder: Path) -> list[Path]:
+    """Return the pictures in a folder in natural order of their names, hidden files left out."""
+    pictures = (path for path in folder.iterdir() if path.suffix.lower() in PICTURE_SUFFIXES)
+    return sort_naturally(path for path in pictures if path.name[0] != ".")
 
 
 def wrap_frame_array(pictures: Any, times: np.ndarray, unit: str | None = None) -> RawFrames:

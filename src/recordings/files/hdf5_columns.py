@@ -17,9 +17,8 @@ from src.recordings.files.columns import (
     find_time_unit_in_text,
     require_one_time_column,
 )
-from src.recordings.files.event_file import ReadOptions, refuse_column_order
-from src.recordings.files.numpy_file import LazyColumn, has_event_per_column, split_table
-from src.recordings.files.time_unit import UNITS_US
+from src.recordings.files.event_file import UNITS_US, ReadOptions, refuse_column_order
+from src.recordings.files.lazy_columns import LazyColumn, has_event_per_column, split_table
 
 # Before a number: cam0, leftcam0, cameras/0, view_0, but not review0.
 OF_A_CAMERA = re.compile(r"(?:cam|camera|(?<![a-z])view|(?<![a-z])sensor)s?[\W_]*$")

@@ -44,7 +44,7 @@ from src.recordings.files.hdf5_columns import (
     list_event_array_shapes,
     read_units_attribute,
 )
-from src.recordings.files.numpy_file import (
+from src.recordings.files.lazy_columns import (
     find_order_of_windows,
     has_event_per_column,
     slice_columns,

@@ -14,12 +14,8 @@ import numpy as np
 
 from src.recordings.files.event_file import EventFile, RawEvents, RawFrames, ReadOptions
 from src.recordings.files.frame_files import find_timelens_frames
-from src.recordings.files.numpy_file import (
-    ENOUGH_EVENTS,
-    NumpyFile,
-    find_order_of_windows,
-    read_nameless_table,
-)
+from src.recordings.files.lazy_columns import ENOUGH_EVENTS, find_order_of_windows
+from src.recordings.files.numpy_file import NumpyFile, read_nameless_table
 from src.sim.scenes.video_files import sort_naturally
 
 EVENT_FOLDERS = (".", "events", "events_aligned")

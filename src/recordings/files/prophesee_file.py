@@ -11,7 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from src.recordings.files.clocks import TimestampUnwrapper, read_whole_words
+from src.recordings.files.blocks import read_whole_words
+from src.recordings.files.clocks import TimestampUnwrapper
 from src.recordings.files.event_file import (
     PIECE_EVENTS,
     RAW_FORMATS,

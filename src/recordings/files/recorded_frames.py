@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 
-from src.recordings.files.event_file import HeightWidth, RawFrames, name_file_in_errors
+from src.recordings.files.event_file import UNITS_US, HeightWidth, RawFrames, name_file_in_errors
 from src.recordings.files.recording import EventRecording
-from src.recordings.files.time_unit import UNITS_US
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from src.recordings.engines.event_passes import copy_events_on_sensor
+from src.recordings.engines.event_passes import MAX_COORDINATE, copy_events_on_sensor
 from src.recordings.files.aedat1to3_file import Aedat1To3File
 from src.recordings.files.aedat4_file import Aedat4File
 from src.recordings.files.clocks import TimestampUnwrapper
@@ -40,7 +40,6 @@ from src.recordings.files.numpy_file import NumpyFile
 from src.recordings.files.prophesee_file import PropheseeFile
 from src.recordings.files.rosbag_file import RosbagFile, is_bag_folder
 from src.recordings.files.sensor_size import (
-    MAX_SIDE,
     MOST_OUTSIDE,
     check_sensor_size,
     choose_size,
@@ -217,7 +216,7 @@ def _convert(
         x, y, p = (part[wrong] for part in raw[1:])
         if p not in (-1, 0, 1):
             raise ValueError(f"{path}: polarity must be in -1, 0, 1, got {p}")
-        raise ValueError(f"{path}: x and y must be in 0..{MAX_SIDE - 1}, got {x}, {y}")
+        raise ValueError(f"{path}: x and y must be in 0..{MAX_COORDINATE}, got {x}, {y}")
     p = columns[-1]
     if p.size and p.min() < 0 and not p.all():
         raise ValueError(f"{path}: polarity must be 0 and 1 or -1 and 1, got -1 and 0")

@@ -20,7 +20,7 @@ from rosbags.rosbag2 import storage_mcap as mcap
 from rosbags.rosbag2.reader import DirectoryReader
 from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
-from src.recordings.files.clocks import merge_small_pieces
+from src.recordings.files.blocks import merge_small_pieces
 from src.recordings.files.event_file import (
     EventFile,
     EventStream,

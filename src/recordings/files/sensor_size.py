@@ -10,7 +10,6 @@ import numpy as np
 from src.recordings.files.event_file import EventFile, RawEvents, WidthHeight
 from src.recordings.sensor_limits import LARGEST_SIDE, are_sensor_sides
 
-MAX_SIDE = 2**16  # pixels: coordinates have 16 bits
 WIDEST = 4096  # pixels of a sensor
 SWAPPED_SHARE = 0.01  # of the first events outside that show width and height exchanged
 MOST_OUTSIDE = 0.5  # of all events, from which on a recording is refused

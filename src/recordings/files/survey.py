@@ -6,7 +6,13 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from src.recordings.files.clocks import TimestampUnwrapper
-from src.recordings.files.event_file import EventFile, RawEvents, ReadOptions, name_file_in_errors
+from src.recordings.files.event_file import (
+    UNITS_US,
+    EventFile,
+    RawEvents,
+    ReadOptions,
+    name_file_in_errors,
+)
 from src.recordings.files.event_order import (
     BUFFER_US,
     FEW_EVENTS,
@@ -16,7 +22,6 @@ from src.recordings.files.event_order import (
     EventSorter,
 )
 from src.recordings.files.time_unit import (
-    UNITS_US,
     TimeSample,
     check_times,
     describe_equal_times,

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 from numpy.lib.recfunctions import structured_to_unstructured
 
+from src.recordings.engines.event_passes import MAX_COORDINATE
 from src.recordings.files.columns import (
-    MAX_COORDINATE,
     as_integers,
     check_unpacking_ratio,
     find_columns,
@@ -31,7 +31,7 @@ from src.recordings.files.event_file import (
     name_file_in_errors,
 )
 from src.recordings.files.frame_files import find_listed_frames
-from src.recordings.files.numpy_file import slice_columns, slice_times
+from src.recordings.files.lazy_columns import slice_columns, slice_times
 from src.recordings.files.text_layout import (
     COMMENTS,
     CUT,

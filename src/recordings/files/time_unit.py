@@ -27,9 +27,10 @@ from typing import Any
 
 import numpy as np
 
+from src.recordings.engines.event_passes import MAX_TIME_US
 from src.recordings.files.clocks import NEARLY_A_TURN, TimestampUnwrapper
+from src.recordings.files.event_file import UNITS_US
 
-UNITS_US = {"s": 1e6, "ms": 1e3, "us": 1.0, "ns": 1e-3}
 PRIOR = {
     True: {"us": 0.0, "ns": 2.0, "ms": 2.0, "s": 3.0},  # whole numbers
     False: {"s": 0.0, "ms": 1.0, "us": 1.0, "ns": 2.0},
@@ -41,7 +42,6 @@ CLEAR = 1.5  # points by which a date or a clock that has run for days is taken
 ABSURD_S, ABSURD_HZ = (1e-3, 86_400.0), (10.0, 1e9)  # outside, duration and rate are told of
 FEW_TIMES = 100
 SAMPLES = 1024  # of a piece
-MAX_TIME_US = 2**62
 COUNTER_BITS = (24, 31, 32)  # of counters that go round
 Range = tuple[float, float]
 

@@ -12,9 +12,10 @@ import numpy as np
 from jaxtyping import Float
 
 from src.recordings.files.event_file import name_file_in_errors
+from src.recordings.files.frame_files import list_pictures
 from src.recordings.files.hdf5_file import check_hdf5_safety
 from src.sim.scenes.video_decoding import LARGEST_PIXELS
-from src.sim.scenes.video_files import PICTURE_SUFFIXES, read_picture, sort_naturally
+from src.sim.scenes.video_files import read_picture
 from src.sim.scenes.video_index import index_video
 
 
@@ -65,9 +66,7 @@ def read_times(path: Path) -> Float[np.ndarray, " frames"] | None:
 
 def _frames(path: Path, config_key: str, max_frames: int | None) -> Iterator[np.ndarray]:
     if path.is_dir():
-        found = (name for name in path.iterdir() if name.suffix.lower() in PICTURE_SUFFIXES)
-        names = sort_naturally(name for name in found if name.name[0] != ".")
-        for name in names:
+        for name in list_pictures(path):
             yield read_gray_picture(name, config_key)
     elif path.suffix == ".h5":
         with _opened_h5(path) as file:

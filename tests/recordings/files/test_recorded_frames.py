@@ -118,6 +118,12 @@ def test_pictures_without_times_are_left_out_with_a_word(tmp_path):
         assert find_frames(open_recording(path, SIZE)) is None
 
 
+def test_hidden_files_are_no_pictures(tmp_path):
+    path = write_recording(tmp_path / "cap", "timelens", make_events(), make_frames())
+    (path / "images/._frame1.png").write_bytes(b"\0\5\x16\7")  # as macOS leaves beside one
+    assert np.array_equal(find_frames(open_recording(path)).times_us, FRAME_US)
+
+
 def test_a_time_that_is_wrong_lies_between_its_neighbours(tmp_path):
     path = write_recording(tmp_path / "cap", "timelens", make_events(), make_frames())
     times = [*FRAME_US[:2], START_US + 10, *FRAME_US[3:]]

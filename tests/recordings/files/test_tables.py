@@ -256,7 +256,7 @@ def test_numpy_files(tmp_path, events):
 
 
 def test_a_structured_array_of_several_pieces_out_of_order_is_sorted(tmp_path, monkeypatch, events):
-    monkeypatch.setattr("src.recordings.files.numpy_file.PIECE_EVENTS", 400)
+    monkeypatch.setattr("src.recordings.files.lazy_columns.PIECE_EVENTS", 400)
     late = events.copy()
     late["t"][::50] -= 700
     np.save(tmp_path / "a.npy", late)

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
@@ -23,6 +22,7 @@ from src.app.metrics import SHIPPED_METRIC_KEYS
 from src.metrics.table import Column
 from src.models import files
 from src.models.network import EventToVideoNetwork
+from src.recordings.event_windows import check_time_range
 from src.recordings.evreal_protocol import (
     EvrealRule,
     ScoredFrame,
@@ -31,6 +31,7 @@ from src.recordings.evreal_protocol import (
 )
 from src.recordings.evreal_sequences import find_sequences, open_as_evreal, sequence_name
 from src.recordings.files.evreal_folder import is_evreal_folder, open_sequence
+from src.recordings.output import write_png
 from src.recordings.reconstruction import require_event_network
 from src.records import results
 from src.records.atomic import write_text
@@ -156,8 +157,7 @@ def find_scored_range(data: DictConfig, source: Path) -> tuple[str, float, float
     first, last = span or (0.0, math.inf)
     first = first if data.start_s is None else data.start_s
     last = last if data.end_s is None else data.end_s
-    if not 0 <= first < last:
-        raise ValueError(f"data.start_s must be >= 0 and before data.end_s, got {first}, {last}")
+    check_time_range(first, last, "data.")
     return data_set, float(first), float(last)
 
 
@@ -220,9 +220,7 @@ def describe_other_protocol(data: DictConfig, data_sets: Iterable[str]) -> str:
 def _save(folder: Path, frame: ScoredFrame) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     levels = np.rint(frame.picture * 255).astype(np.uint8)
-    name = folder / f"frame_{frame.window_index:010d}.png"
-    if not cv2.imwrite(str(name), levels):
-        raise OSError(f"{name} cannot be written; is the disk full?")
+    write_png(folder / f"frame_{frame.window_index:010d}.png", levels)
 
 
 def _tables(name: str, means: Mapping[str, Mapping], data: DictConfig) -> Group:

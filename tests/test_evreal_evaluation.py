@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from src.app.benchmark import (
+from src.app.evreal_evaluation import (
     MSE,
     average_by_data_set,
     average_frames,
