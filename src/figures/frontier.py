@@ -49,7 +49,9 @@ def draw_accuracy_against_time(
     spans = [_draw_metric(axes, metric, timed, speeds, scores) for axes, metric in pairs]
     threads = sorted({s.threads for s in speeds if s.threads > 1})
     more = f"; lines: to {' and '.join(map(str, threads))} threads" if threads else ""
-    figure.supxlabel(f"ms from events to a frame of {side}x{side}, one CPU thread{more}")
+    figure.supxlabel(
+        f"ms from events to a frame of {side}x{side}, one CPU thread{more}", fontsize=10
+    )
     clips = len({(score.severity, score.clip) for score in scores})
     figure.suptitle(f"{title}, {clips} clip{'s' * (clips != 1)}")
     _draw_legend(figure, timed)
@@ -136,7 +138,8 @@ def _draw_legend(figure: Figure, timed: Mapping[str, SpeedMeasurement]) -> None:
     bar = {"marker": "|", "markersize": 11, "markeredgewidth": 0.8, "color": "0.35"}
     what = "standard error of the difference to the best"
     handles.append(Line2D([], [], ls="none", label=what, **bar))
-    figure.legend(handles=handles, loc="outside lower right", ncols=4, frameon=False)
+    place: dict[str, Any] = {"loc": "outside lower right", "ncols": 2, "columnspacing": 1}
+    figure.legend(handles=handles, **place, frameon=False, fontsize=9)
 
 
 def _name_points(axes: Axes, spans: Mapping[str, Span]) -> None:
