@@ -135,7 +135,7 @@ def _draw_legend(figure: Figure, timed: Mapping[str, SpeedMeasurement]) -> None:
     named = {_colour(s): "one view" if s.views == 1 else f"{s.views} views" for s in timed.values()}
     handles = [Line2D([], [], ls="none", marker="o", color=c, label=n) for c, n in named.items()]
     handles.append(Line2D([], [], ls="--", lw=1, color="0.35", label="Pareto front"))
-    bar = {"marker": "|", "markersize": 11, "markeredgewidth": 0.8, "color": "0.35"}
+    bar: dict[str, Any] = {"marker": "|", "markersize": 11, "markeredgewidth": 0.8, "color": "0.35"}
     what = "standard error of the difference to the best"
     handles.append(Line2D([], [], ls="none", label=what, **bar))
     place: dict[str, Any] = {"loc": "outside lower right", "ncols": 2, "columnspacing": 1}
