@@ -13,20 +13,18 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from baselines.centre_view import CentreViewNetwork
-from src.models.e2vid import E2VID, SCALES
+from baselines.e2vid_plus import E2VIDPlus
+from src.models.e2vid import SCALES
 
 HEADS, DROPOUT = 8, 0.1
 Tokens = Float[Tensor, "n tokens c"]
 
 
-class ETNet(CentreViewNetwork):
+class ETNet(E2VIDPlus):
     """The centre view's voxel grids to frames; 22,175,361 parameters.
 
     As published: normalise none, output sigmoid.
     """
-
-    side_multiple = 2**SCALES
 
     def __init__(
         self,
@@ -35,8 +33,7 @@ class ETNet(CentreViewNetwork):
         normalise: str = "none",
         output: str = "sigmoid",
     ):
-        super().__init__(bins, normalise, output)
-        self.net = E2VID(1, bins, base_channels, final_activation="none")
+        super().__init__(bins, base_channels, normalise, output)
         self.net.resblocks = nn.Sequential()
         self.pyramid = TokenPyramidAggregation(
             [base_channels * 2**scale for scale in range(SCALES, 0, -1)]
@@ -45,9 +42,6 @@ class ETNet(CentreViewNetwork):
     def predict_before_activation(self, grid: Tensor, state: Any) -> tuple[Tensor, Any]:
         head, skips, after = self.net.encode(self.net.first_layer(grid), state)
         return self.net.decode_logits(self.pyramid(skips[::-1]), head, skips), after
-
-    def state_sizes(self, grid: Tensor) -> list[tuple[int, ...]]:
-        return self.net.state_sizes(grid)
 
 
 class TokenPyramidAggregation(nn.Module):

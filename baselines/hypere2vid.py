@@ -15,26 +15,22 @@ from scipy.special import jn_zeros, jv
 from torch import Tensor, nn
 from torch.nn import functional
 
-from baselines.centre_view import CentreViewNetwork
-from src.models.e2vid import E2VID, SCALES
+from baselines.e2vid_plus import E2VIDPlus
 from src.models.layers import require_bias
 
 ATOMS, FUNCTIONS = 6, 6  # functions of each of the two reaches
 
 
-class HyperE2VID(CentreViewNetwork):
+class HyperE2VID(E2VIDPlus):
     """The centre view's voxel grids to frames; 10,149,881 parameters and 574 numbers in buffers.
 
     As published: normalise none, output clip.
     """
 
-    side_multiple = 2**SCALES
-
     def __init__(
         self, bins: int = 5, base_channels: int = 32, normalise: str = "none", output: str = "clip"
     ):
-        super().__init__(bins, normalise, output)
-        self.net = E2VID(1, bins, base_channels, final_activation="none")
+        super().__init__(bins, base_channels, normalise, output)
         self.net.decoders = self.net.decoders[1:]
         self.dynamic = DynamicDecoder(8 * base_channels, 4 * base_channels, bins + 1)
 
@@ -48,7 +44,7 @@ class HyperE2VID(CentreViewNetwork):
         return frame, (after, frame.detach())
 
     def state_sizes(self, grid: Tensor) -> list[tuple[int, ...]]:
-        return [*self.net.state_sizes(grid), (len(grid), 1, *grid.shape[2:])]
+        return [*super().state_sizes(grid), (len(grid), 1, *grid.shape[2:])]
 
 
 class DynamicDecoder(nn.Module):

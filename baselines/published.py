@@ -156,12 +156,15 @@ def load_pretrained(architecture: str, weights: str | None) -> nn.Module:
     `weights`: a name in weights/ or a path of ours (.safetensors, .ckpt), trained on clean events;
     or the path of the published checkpoint.  Raises ValueError, which says where to get them, when
     there are none, and when they are another network's.
+
+    All were published with bins between the first and last event of a window; the simulator uses
+    its edges.
     """
     network_class = _find_architecture(architecture).network_class
     path = files.locate(weights or "")
     if path.is_file() and path.suffix in OURS:
         network = files.load(path).requires_grad_(False)
-        if not isinstance(network, network_class):
+        if type(network) is not network_class:  # HyperE2VID and ET-Net are kinds of E2VID+
             got = f"a {type(network).__name__} is in {weights}"
             raise ValueError(f"baseline.weights are not those of {architecture}: {got}")
         return network

@@ -415,16 +415,11 @@ def configs(name: str, folder: Path) -> list[DictConfig]:
 
 
 @pytest.mark.parametrize("name", names())
-def test_every_stage_of_every_recipe_is_a_config(name, tmp_path):
-    recipe = read(name)
-    for stage, cfg in zip(recipe.stages, configs(name, tmp_path), strict=True):
+def test_a_recipe_is_of_configs_and_shows_what_the_shipped_network_was_shown(name, tmp_path):
+    recipe, stages = read(name), configs(name, tmp_path)
+    for stage, cfg in zip(recipe.stages, stages, strict=True):
         assert cfg.seed == stage.seed and cfg.name == recipe.experiment
-
-
-@pytest.mark.parametrize("name", names())
-def test_a_recipe_shows_what_the_shipped_network_was_shown(name, tmp_path):
-    card = files.read_card(files.WEIGHTS / f"{name}.safetensors")
-    cfg = configs(name, tmp_path)[-1]
+    card, cfg = files.read_card(files.WEIGHTS / f"{name}.safetensors"), stages[-1]
     kind = card["scenes"].split(",")[0]
     assert cfg.scene["_target_"].endswith(f".{kind}") and cfg.optics.views == card["views"]
     if kind == "Photographs":  # of a time without drawn sensors and losses of several windows

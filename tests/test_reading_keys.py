@@ -10,7 +10,8 @@ from src.convert import convert
 from src.live import build_server
 from src.reconstruct import reconstruct
 from src.recordings.files import ReadOptions, open_recording, read_events, recording_inputs
-from tests.recordings.files.test_reported_times import quiet_read, scene, text
+from tests.recordings.files.tables import quiet_read
+from tests.recordings.files.test_table_times import scene, text
 from tests.test_recording_entry_points import config
 
 ENTRY_POINTS = {

@@ -10,6 +10,7 @@ from baselines.stabilise import backward_warp_video, estimate_jitter
 from src.app.instantiate import instantiate_node
 from src.models.network import FramePostprocessor
 from tests.conftest import ROOT
+from tests.models.learning import learn_by_heart
 
 
 def small(stabilise_input: bool = False) -> MambaTM:
@@ -137,15 +138,7 @@ def test_gradients_reach_every_parameter(stabilise_input):
 def test_it_can_learn_one_clip_by_heart():
     network, frames = small().train(), torch.rand(1, 4, 1, 16, 16)
     target = torch.nn.functional.avg_pool2d(frames.flatten(0, 1), 3, 1, 1).view_as(frames)
-    optimizer = torch.optim.Adam(network.parameters(), 3e-3)
-    losses = []
-    for _ in range(40):
-        loss = (network(frames)[0] - target).square().mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        losses.append(float(loss.detach()))
-    assert losses[-1] < 0.2 * losses[0]
+    assert learn_by_heart(network, lambda: network(frames)[0], target, 3e-3, 40) < 0.2
 
 
 def test_bad_arguments_name_their_key():

@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from baselines import etnet, hypere2vid, published
 from baselines.firenet import FireNet
 from baselines.mambatm import MambaTM
 from baselines.postprocess import CameraFrames, Postprocessed
@@ -153,3 +154,13 @@ def test_our_own_frozen_weights_load_by_name_or_path(tmp_path, monkeypatch):
         instantiate_node(target | {"architecture": "etnet", "weights": str(path)})
     with pytest.raises(ValueError, match=r"baseline\.weights .* authors' checkpoint"):
         instantiate_node(target | {"architecture": "cista", "weights": None})
+
+
+@pytest.mark.parametrize("kind", [etnet.ETNet, hypere2vid.HyperE2VID])
+def test_weights_of_a_kind_of_e2vid_plus_are_not_those_of_e2vid_plus(kind, tmp_path):
+    target = f"{kind.__module__}.{kind.__name__}"
+    spec = {"target": target, "kwargs": {"base_channels": 4}}
+    path = tmp_path / "a.safetensors"
+    files.save(path, kind(base_channels=4), spec, {})
+    with pytest.raises(ValueError, match=r"not those of e2vid_plus: a \w+ is in"):
+        published.load_pretrained("e2vid_plus", str(path))

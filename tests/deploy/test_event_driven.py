@@ -2,7 +2,6 @@
 
 import copy
 
-import jaxtyping
 import numpy as np
 import pytest
 import torch
@@ -13,9 +12,11 @@ from src.deploy import openvino_network, setnet_tiles
 from src.deploy.runtime import EventListRuntime
 from src.models.setnet import SetNet
 from src.sim.voxel import voxel_grid
+from tests.deploy.conftest import form
 
+pytestmark = pytest.mark.usefixtures("unchecked")
 EXACT = 1e-5
-WINDOWS = 20
+WINDOWS = 10
 FORMS = ["float32", "openvino"]
 QUIET, ALONE, BLOB, EVERYWHERE = "quiet", "alone", "blob", "everywhere"
 
@@ -93,20 +94,6 @@ def largest_gap(net: SetNet, live: EventListRuntime, windows: list, views: int) 
         for a, b in ((a.numpy(), b) for a, b in pairs):
             gap = max(gap, float(abs(a - b).max() / max(1, abs(a).max())))
     return gap
-
-
-def form(name: str) -> str:
-    if name == "openvino" and not openvino_network.is_installed():
-        pytest.skip("needs the extra openvino")
-    return name
-
-
-@pytest.fixture(autouse=True)
-def unchecked():
-    """Without the checks of annotations: to a network that is traced its sizes are tensors."""
-    jaxtyping.config.update("jaxtyping_disable", True)
-    yield
-    jaxtyping.config.update("jaxtyping_disable", False)
 
 
 @pytest.fixture

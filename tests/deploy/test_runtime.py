@@ -8,7 +8,6 @@ import sys
 import warnings
 from pathlib import Path
 
-import jaxtyping
 import numpy as np
 import pytest
 import torch
@@ -24,6 +23,7 @@ from src.models.setnet import SetNet
 from src.sim.optics import layout
 from src.sim.voxel import voxel_grid
 from tests.conftest import default_dtype
+from tests.deploy.conftest import form
 
 EXACT, ROUNDED = 1e-5, 0.02  # in grey levels: sums in another order, and bf16
 NETWORKS = {
@@ -42,23 +42,9 @@ OPENVINO = pytest.mark.skipif(
 )
 
 
-@pytest.fixture
-def unchecked():
-    """Without the checks of annotations: to a network that is traced its sizes are tensors."""
-    jaxtyping.config.update("jaxtyping_disable", True)
-    yield
-    jaxtyping.config.update("jaxtyping_disable", False)
-
-
 def network(name: str) -> torch.nn.Module:
     torch.manual_seed(0)
     return NETWORKS[name]().eval()
-
-
-def form(name: str) -> str:
-    if name == "openvino" and not openvino_network.is_installed():
-        pytest.skip("needs the extra openvino")
-    return name
 
 
 def events(seed: int, count: int = 400, height: int = 24, width: int = 32, views: int = 9) -> dict:

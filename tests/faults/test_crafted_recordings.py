@@ -19,7 +19,7 @@ from src.recordings.files.rosbag_file import RosbagFile
 from tests.recordings.files.bags import Bag
 from tests.recordings.files.test_aedat1to3_file import aedat3, dvs128, words
 from tests.recordings.files.test_aedat1to3_file import packet as polarity
-from tests.recordings.files.test_aedat_file import LEFT, made, packet
+from tests.recordings.files.test_aedat4_file import LEFT, made, packet
 from tests.recordings.files.test_prophesee_file import evt2, evt21
 from tests.recordings.files.test_recording import made_up, mutated
 

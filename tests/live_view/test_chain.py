@@ -37,7 +37,7 @@ from src.recordings.files.event_writers import write_events
 from src.recordings.files.recording import read_events
 from src.recordings.sensor_lookup import build_lookup
 from tests.live_view import scenes
-from tests.live_view.browser import free_port
+from tests.live_view.browser import free_port, until
 from tests.test_recording_entry_points import config
 
 
@@ -217,7 +217,7 @@ def test_a_file_that_loops_starts_each_time_as_the_first(recording):
     player.reader.feed.loop = True
     screen.push = lambda picture: shown.append(picture.copy())
     player.start()
-    _until(lambda: len(shown) > 110)
+    until(lambda: len(shown) > 110)
     dropped = player.reader.waiting.dropped
     player.stop()
     moving = [k for k in range(20, 40) if np.array_equal(shown[k], shown[0])]
@@ -435,8 +435,8 @@ def test_as_fast_as_it_goes_every_picture_is_that_of_reconstruct(recording):
     made = served(recording, {"net": network}, playback_speed=float("inf"))
     player, screen = made.page.player, made.page.frames
     player.start()
-    _until(lambda: player.reader.state == "ended" and not len(player.reader.waiting))
-    _until(lambda: screen.count >= 29)
+    until(lambda: player.reader.state == "ended" and not len(player.reader.waiting))
+    until(lambda: screen.count >= 29)
     player.stop()
     rule = event_windows.WindowRule(fps=100.0, splat="nearest")
     windows = event_windows.cut_windows(
@@ -455,7 +455,7 @@ def test_a_recording_shorter_than_a_window_is_said_so(tmp_path):
     write_events(tmp_path / "a.npz", scenes.events(0.01)[:1], width=width, height=height)
     player = served(str(tmp_path / "a.npz"), {"net": SetNet.preset("small").eval()}).page.player
     player.start()
-    _until(lambda: player.reader.state == "ended")
+    until(lambda: player.reader.state == "ended")
     player.stop()
     line = "recording must be longer than one window of 1/100 s, got 0 s"
     assert player.reader.faults.current() == [line]
@@ -494,7 +494,7 @@ def test_the_recorded_time_is_that_of_the_frame_shown_also_while_nothing_moves(r
     player, screen = made.page.player, made.page.frames
     assert player.status()["time_s"] is None
     player.start()
-    _until(lambda: screen.count >= 30)
+    until(lambda: screen.count >= 30)
     count, status = screen.count, player.status()
     player.stop()
     assert count / 100 - 1e-3 <= status["time_s"] - start_us * 1e-6 < 5  # the next event: at 8 s
@@ -568,7 +568,7 @@ def test_what_cannot_keep_up_drops_windows_and_keeps_its_latency(recording):
     made = served(recording, {"slow": Slow()}, fps=400.0, max_waiting_windows=4)
     player = made.page.player
     player.start()
-    _until(lambda: player.reader.state == "ended")
+    until(lambda: player.reader.state == "ended")
     status = player.status()
     player.stop()
     player.reader.state = "playing"
@@ -587,7 +587,7 @@ def test_a_file_that_breaks_off_is_told(recording, tmp_path, monkeypatch):
     monkeypatch.setattr(event_feeds, "cut_chunks", broken)
     made = served(recording, {"net": HighPass()})
     made.page.player.start()
-    _until(lambda: made.page.player.status()["state"] == "broken")
+    until(lambda: made.page.player.status()["state"] == "broken")
     assert "cannot be decoded" in made.page.player.status()["faults"][0]
     made.page.player.stop()
 
@@ -758,19 +758,12 @@ def test_views_that_are_not_there_are_refused(recording, use):
         made.page.controls.choose("net", use)
 
 
-def _until(seen, seconds: float = 60.0) -> None:
-    end = time.monotonic() + seconds
-    while not seen():
-        assert time.monotonic() < end
-        time.sleep(0.02)
-
-
 def test_one_view_runs_beside_all_of_them(recording):
     made = served(recording, {"net": SetNet.preset("small").eval()}, playback_speed=float("inf"))
     made.page.handle_request({"one_view": True, "tone": "auto"})
     player = made.page.player
     player.start()
-    _until(lambda: player.one_view is not None and made.page.frames.count > 5)
+    until(lambda: player.one_view is not None and made.page.frames.count > 5)
     assert b'"one-view"' in made.page.message(whole=True)
     status = made.page.status()
     player.stop()

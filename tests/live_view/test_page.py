@@ -17,6 +17,7 @@ import pytest
 
 from tests.conftest import ROOT
 from tests.live_view import browser, scenes
+from tests.live_view.browser import until
 
 STATE = "return document.getElementById('state').dataset.state === '{}'"
 FAULT = "return document.getElementById('faults').textContent.includes('{}')"
@@ -110,9 +111,9 @@ def test_pictures_come_and_change(server, page, dot):
         for name in ("frame", "events", "slice"):
             page.wait(f"return document.getElementById('{name}').width > 0")
             before = page.pixels(name)
-            _until(lambda name=name, before=before: page.pixels(name) != before)
+            until(lambda name=name, before=before: page.pixels(name) != before)
             assert np.std(before) > 1, name
-        _until(lambda: 0 < server.status()["fps"] < 40)  # frames that were late have caught up
+        until(lambda: 0 < server.status()["fps"] < 40)  # frames that were late have caught up
         status = server.status()
     assert status["asked_fps"] == 30
     assert status["events_per_s"] > 1000 and status["views"] == 9
@@ -123,7 +124,7 @@ def test_the_slice_follows_a_drag(server, page, dot):
     with scenes.Sender(dot, server.events):
         page.wait(STATE.format("playing"))
         page.drag("line", (0.5, 0.1), (0.5, 0.6))
-        _until(lambda: page.run("return document.getElementById('slice').height") == 45)
+        until(lambda: page.run("return document.getElementById('slice').height") == 45)
         x0, y0, x1, y1 = server.status()["line"]
     assert abs(x0 - x1) < 1 and x0 == pytest.approx(43.5, abs=1)
     assert (y0, y1) == (pytest.approx(8.3, abs=1), pytest.approx(52.3, abs=1))
@@ -140,7 +141,7 @@ def test_pause_pauses_and_play_plays(server, page, dot):
         assert page.pixels("frame") == before
         page.click("pause")
         page.wait(STATE.format("playing"))
-        _until(lambda: page.pixels("frame") != before)
+        until(lambda: page.pixels("frame") != before)
 
 
 def test_another_network_on_fewer_views_and_all_views_shown(server, page, dot):
@@ -148,13 +149,13 @@ def test_another_network_on_fewer_views_and_all_views_shown(server, page, dot):
         page.wait(STATE.format("playing"))
         page.run("const s = document.getElementById('network'); s.value = 'setnet_medium';"
                  "s.dispatchEvent(new Event('change'))")  # fmt: skip
-        _until(lambda: server.status()["network"] == "setnet_medium")
+        until(lambda: server.status()["network"] == "setnet_medium")
         page.run("const s = document.getElementById('use'); s.value = '3';"
                  "s.dispatchEvent(new Event('change'))")  # fmt: skip
-        _until(lambda: server.status()["views"] == 3)
+        until(lambda: server.status()["views"] == 3)
         page.click("show-all")
-        _until(lambda: page.run("return document.getElementById('views').offsetHeight > 50"))
-        _until(lambda: np.std(page.pixels("views")) > 1)
+        until(lambda: page.run("return document.getElementById('views').offsetHeight > 50"))
+        until(lambda: np.std(page.pixels("views")) > 1)
         page.click("show-all")
 
 
@@ -188,7 +189,7 @@ def test_a_stream_that_jumps_back_or_has_another_size_is_told_and_recovers(serve
 
 def test_a_picture_for_those_who_ask_and_none_for_other_sites(server, dot):
     with scenes.Sender(dot, server.events, first_us=6_000_000):
-        _until(lambda: server.status()["fps"] > 0)
+        until(lambda: server.status()["fps"] > 0)
     with urlopen(f"{server.address}/frame.png", timeout=30) as answer:
         picture = cv2.imdecode(np.frombuffer(answer.read(), np.uint8), cv2.IMREAD_UNCHANGED)
     assert picture.shape == (scenes.SIDE, scenes.SIDE) and picture.dtype == np.uint8
@@ -229,10 +230,3 @@ def test_a_page_whose_server_is_gone_says_so(server, page):
     page.wait(STATE.format("disconnected"))
     page.wait(FAULT.format("trying again"))
     assert page.run("return document.querySelector('main').inert")
-
-
-def _until(seen, seconds: float = 60.0) -> None:
-    end = time.monotonic() + seconds
-    while not seen():
-        assert time.monotonic() < end
-        time.sleep(0.05)

@@ -59,16 +59,6 @@ def test_no_activation_is_unbounded():
     assert float(network(50 * torch.randn(1, 2, 3, 16, 16), None)[0].min()) < 0
 
 
-@pytest.mark.parametrize("recurrent", ["convlstm", "convgru"])
-@torch.no_grad()
-def test_law_6_two_chunks_equal_one(recurrent):
-    network = small(recurrent=recurrent)
-    whole, _ = unroll(network, voxels())
-    first, state = unroll(network, voxels()[:, :1])
-    second, _ = unroll(network, voxels()[:, 1:], state)
-    assert torch.equal(whole, torch.cat([first, second], 1))
-
-
 @pytest.mark.parametrize("state_rounding_step", [None, 0.25])
 @torch.no_grad()
 def test_windows_without_output_warm_up_the_state(state_rounding_step):
@@ -81,14 +71,6 @@ def test_windows_without_output_warm_up_the_state(state_rounding_step):
     assert torch.equal(some, whole[:, [1, 4]]) and len(drawn) == 2
     for ours, theirs in zip(same, state, strict=True):
         assert all(map(torch.equal, ours, theirs))
-
-
-@torch.no_grad()
-def test_clips_of_a_batch_do_not_meet():
-    network = small()
-    alone, _ = unroll(network, voxels()[1:])
-    together, _ = unroll(network, voxels())
-    assert torch.allclose(together[1:], alone, atol=1e-6)
 
 
 @torch.no_grad()
@@ -230,27 +212,3 @@ def test_spectral_norm_is_computed_once_in_a_cached_unroll():
     gate = network.cells[0].gates
     with parametrize.cached():
         assert gate.weight is gate.weight
-
-
-@pytest.mark.parametrize("recurrent", ["convlstm", "convgru"])
-def test_gradients_reach_every_parameter(recurrent):
-    network = small(recurrent=recurrent)
-    frames, _ = unroll(network, voxels())
-    (frames * torch.randn_like(frames)).sum().backward()
-    assert all(float(p.grad.abs().sum()) > 0 for p in network.parameters())
-
-
-def test_it_can_learn_one_batch_by_heart():
-    network = small(base_channels=8)
-    target = torch.rand(2, 4, 1, 16, 16, generator=torch.Generator().manual_seed(2))
-    target = torch.nn.functional.avg_pool2d(target.flatten(0, 1), 5, 1, 2).view_as(target)
-    optimizer = torch.optim.Adam(network.parameters(), 3e-3)
-    losses = []
-    for _ in range(80):
-        frames, _ = unroll(network, voxels())
-        loss = (frames - target).square().mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        losses.append(float(loss.detach()))
-    assert losses[-1] < 0.25 * losses[0]

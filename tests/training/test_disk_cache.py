@@ -219,6 +219,18 @@ def test_wrong_values_of_a_config_are_one_line(wrong, message, tmp_path):
         simulations.build_pipeline(config("train", tmp_path, *SMALL, *asked), "train")
 
 
+def clip_cache_folder(root: Path, *changed: str) -> Path:
+    asked = ["data.cache_clips=2", f"data.cache_root={root}"]
+    return simulations.build_clip_cache(config("train", root, *SMALL, *asked, *changed)).folder
+
+
+@pytest.fixture(scope="module")
+def root_and_folder(tmp_path_factory) -> tuple[Path, Path]:
+    """The root of caches and the folder of one that others are compared with."""
+    root = tmp_path_factory.mktemp("caches")
+    return root, clip_cache_folder(root)
+
+
 @pytest.mark.parametrize(
     ("changed", "same"),
     [
@@ -235,13 +247,9 @@ def test_wrong_values_of_a_config_are_one_line(wrong, message, tmp_path):
         (["data.cache_windows=5"], False),
     ],
 )
-def test_a_cache_is_shared_by_all_that_its_clips_do_not_depend_on(changed, same, tmp_path):
-    asked = ["data.cache_clips=2", f"data.cache_root={tmp_path}"]
-    first, other = (
-        simulations.build_clip_cache(config("train", tmp_path, *SMALL, *asked, *more))
-        for more in ([], changed)
-    )
-    assert (first.folder == other.folder) == same
+def test_a_cache_is_shared_by_all_that_its_clips_do_not_depend_on(changed, same, root_and_folder):
+    root, folder = root_and_folder
+    assert (clip_cache_folder(root, *changed) == folder) == same
 
 
 def test_without_turbulence_a_cache_holds_the_views_asked_for(tmp_path):
@@ -373,7 +381,8 @@ def test_a_filler_ends_with_the_training_that_started_it(tmp_path):
     until(lambda: not runs(filler))
 
 
-def test_of_two_fillers_one_fills_and_the_other_takes_over_and_ends(tmp_path):
+def test_of_two_fillers_one_fills_and_the_other_takes_over_and_ends(tmp_path, monkeypatch):
+    monkeypatch.setattr(multiprocessing, "get_context", lambda _: FORKS)  # the imports are done
     first, second = (CacheFillerProcess(disk_cache(tmp_path, 6, scene=Slow())) for _ in range(2))
     first.start()
     until(lambda: list(tmp_path.glob("*/*.pt")))

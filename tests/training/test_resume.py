@@ -90,18 +90,26 @@ def rates(folder) -> tuple[float, list[int]]:
 
 HOURS = ["scheduler=null", "train_hours=1000"]
 GOING_ON = [
-    ([], ["scheduler.T_max=8", "optimizer.lr=0.1"], cosine(0.1, 3, 8), [8]),
-    (HOURS, [*HOURS, "optimizer.lr=0.1"], 0.1, []),
-    ([], [*HOURS, "optimizer.lr=0.1"], 0.1, []),
+    ("steps", ["scheduler.T_max=8"], cosine(0.1, 3, 8), [8]),
+    ("hours", HOURS, 0.1, []),
+    ("steps", HOURS, 0.1, []),
 ]
 
 
+@pytest.fixture(scope="module")
+def begun(tmp_path_factory):
+    """The folder of two trainings of two steps, with a scheduler and by time."""
+    folder = tmp_path_factory.mktemp("begun")
+    for name, words in (("steps", []), ("hours", HOURS)):
+        train(config("train", folder / name, *TINY, *words, "trainer.max_steps=2"))
+    return folder
+
+
 @pytest.mark.parametrize(("before", "after", "rate", "schedules"), GOING_ON)
-def test_a_run_that_goes_on_obeys_its_config(before, after, rate, schedules, tmp_path):
-    train(config("train", tmp_path / "a", *TINY, *before, "trainer.max_steps=2"))
-    ckpt = f"ckpt={tmp_path / 'a'}"
-    train(config("train", tmp_path / "b", *TINY, *after, "trainer.max_steps=3", ckpt))
-    found = rates(tmp_path / "b")
+def test_a_run_that_goes_on_obeys_its_config(before, after, rate, schedules, begun, tmp_path):
+    more = [*after, "optimizer.lr=0.1", "trainer.max_steps=3", f"ckpt={begun / before}"]
+    train(config("train", tmp_path, *TINY, *more))
+    found = rates(tmp_path)
     assert found[0] == pytest.approx(rate, rel=1e-4) and found[1] == schedules
 
 

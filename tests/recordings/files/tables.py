@@ -1,11 +1,12 @@
 """Event files of any kind, tables too, which the program reads but does not write."""
 
+import warnings
 from pathlib import Path
 
 import h5py
 import numpy as np
 
-from src.recordings.files import event_writers
+from src.recordings.files import ReadOptions, event_writers, read_events
 
 TABLES = (".txt", ".csv", ".npz", ".h5", ".hdf5")
 
@@ -39,3 +40,10 @@ def write_table(path: Path, events: np.ndarray, size: tuple[int, int]) -> None:
         header = comma.join(["t", f"x@{size[0]}", f"y@{size[1]}", "p"])
         table = np.stack([column.astype(np.int64) for column in data.values()], 1)
         np.savetxt(path, table, fmt="%d", delimiter=comma, header=header, comments="")
+
+
+def quiet_read(path: Path, **options) -> np.ndarray:
+    """Return the events; a warning is an error."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        return read_events(path, options=ReadOptions(**options))

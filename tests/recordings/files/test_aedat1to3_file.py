@@ -2,23 +2,19 @@
 
 import struct
 import warnings
+from functools import partial
 
 import numpy as np
 import pytest
 
 from src.recordings.files import open_recording, read_events
 from src.recordings.files.aedat1to3_file import Aedat1To3File
-from src.recordings.files.event_file import RawEvents, ReadOptions
+from tests.recordings.files import raw_events
+from tests.recordings.files.raw_events import equal
 from tests.recordings.files.test_recording import made_up
-from tests.recordings.files.test_rosbag_file import equal
 
 DAVIS = b"#!AER-DAT2.0\r\n# HardwareInterface: DAViSFX3\r\n# AEChip: eu.seebetter.ini.chips.davis."
-
-
-def read(path, content: bytes, **options) -> tuple[Aedat1To3File, RawEvents]:
-    path.write_bytes(content)
-    file = Aedat1To3File(path, ReadOptions(**options))
-    return file, RawEvents(*map(np.concatenate, zip(*file.pieces(), strict=True)))
+read = partial(raw_events.read, Aedat1To3File)
 
 
 def words(addresses, t, width: str = ">u4") -> bytes:

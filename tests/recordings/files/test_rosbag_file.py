@@ -1,26 +1,21 @@
 """Bags of ROS 1 and 2: events, topics and encodings as rosbags wrote them."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 
 from src.recordings.files import read_events, recording_inputs
-from src.recordings.files.event_file import RawEvents, ReadOptions
+from src.recordings.files.event_file import ReadOptions
 from src.recordings.files.event_writers import write_events
 from src.recordings.files.rosbag_file import RosbagFile
+from tests.recordings.files import raw_events
 from tests.recordings.files.bags import ARRAYS, PACKETS, Bag
+from tests.recordings.files.raw_events import equal
 from tests.recordings.files.test_recording import made_up
 
 KINDS = [(".bag", None), ("", "sqlite3"), (".db3", "sqlite3"), ("", "mcap"), (".mcap", "mcap")]
-
-
-def read(path, **options) -> tuple[RosbagFile, RawEvents]:
-    file = RosbagFile(path, ReadOptions(**options))
-    return file, RawEvents(*map(np.concatenate, zip(*file.pieces(), strict=True)))
-
-
-def equal(found: RawEvents, events: np.ndarray) -> bool:
-    columns = [np.array_equal(getattr(found, name), events[name]) for name in "txy"]
-    return all(columns) and np.array_equal(np.asarray(found.p) > 0, events["p"] > 0)
+read = partial(raw_events.read, RosbagFile)
 
 
 def bag_at(folder, ending: str):

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from src.recordings.files import ReadOptions, read_events, text_file
-from tests.recordings.files.test_tables import assert_read, events, lines
+from tests.recordings.files.tables import quiet_read
+from tests.recordings.files.test_table_forms import assert_read, events, lines
 
 __all__ = ["events"]  # a fixture
 SLOW = 1500  # times the 0.2 s of the scene: the values alone would tell another unit
@@ -43,10 +44,31 @@ def test_a_name_states_the_unit(tmp_path, events, name, form):
     assert np.array_equal(read_events(tmp_path / "a.csv"), slow)
 
 
+@pytest.mark.parametrize(("unit", "scale"), [("ms", 1e-3), ("ns", 1e3), ("us", 1.0), ("s", 1e-6)])
+def test_a_unit_in_the_name_of_the_times_holds_in_every_table(tmp_path, events, unit, scale):
+    """Times of a sparse recording, finer than a microsecond, from which it cannot be told."""
+    columns = {f"t_{unit}": events["t"] * 100 * scale + 1e-7} | {key: events[key] for key in "xyp"}
+    kinds = [(key, column.dtype) for key, column in columns.items()]
+    table = np.array(list(zip(*columns.values(), strict=True)), kinds)
+    np.savez(tmp_path / "a.npz", **columns)
+    np.savez(tmp_path / "b.npz", events=table)
+    np.save(tmp_path / "a.npy", table)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for key, column in columns.items():
+            file[f"events/{key}"] = column
+    for path in ("a.npz", "b.npz", "a.npy", "a.h5"):
+        assert np.array_equal(quiet_read(tmp_path / path)["t"], events["t"] * 100), path
+
+
 def test_a_stated_unit_goes_before_the_name(tmp_path, events):
     (tmp_path / "a.csv").write_text("t_ns,x,y,p\n" + lines(events, between=","))
     found = read_events(tmp_path / "a.csv", options=ReadOptions(time_unit="us"))
     assert np.array_equal(found, events)
+    columns = {"t_ms": events["t"] * 1e-3} | {key: events[key] for key in "xyp"}
+    np.savez(tmp_path / "a.npz", **columns)
+    with pytest.warns(UserWarning, match="times in s give 200 s"):
+        found = read_events(tmp_path / "a.npz", options=ReadOptions(time_unit="s"))
+    assert np.array_equal(found["t"], events["t"] * 1000)
 
 
 @pytest.mark.parametrize(("per_us", "kind"), [(1, np.int64), (1000, np.int64), (1e-6, float)])

@@ -1,6 +1,7 @@
 """AEDAT4: packets of one and several streams, packed and cut."""
 
 import struct
+from functools import partial
 
 import faery
 import numpy as np
@@ -9,9 +10,10 @@ from faery.file_encoder import events_to_file
 
 from src.recordings.files import aedat4_file as aedat_file
 from src.recordings.files.aedat4_file import Aedat4File
-from src.recordings.files.event_file import RawEvents, ReadOptions
+from src.recordings.files.event_file import ReadOptions
+from tests.recordings.files import raw_events
+from tests.recordings.files.raw_events import equal
 from tests.recordings.files.test_recording import made_up
-from tests.recordings.files.test_rosbag_file import equal
 
 STREAM = (
     '<node name="{id}" path="/outInfo/{id}/"><attr key="typeIdentifier" type="string">{kind}</attr>'
@@ -19,13 +21,7 @@ STREAM = (
     '<attr key="sizeY" type="int">{size[1]}</attr><attr key="source" type="string">{name}</attr>'
     "</node></node>"
 )
-
-
-def read(path, content: bytes | None = None, **options) -> tuple[Aedat4File, RawEvents]:
-    if content is not None:
-        path.write_bytes(content)
-    file = Aedat4File(path, ReadOptions(**options))
-    return file, RawEvents(*map(np.concatenate, zip(*file.pieces(), strict=True)))
+read = partial(raw_events.read, Aedat4File)
 
 
 def faerys(path, events, pieces: int = 1, compression=None) -> bytes:

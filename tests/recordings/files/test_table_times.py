@@ -2,12 +2,12 @@
 
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 
 from src.recordings.files import ReadOptions, open_recording, read_events
 from src.recordings.files.event_file import EVENT
+from tests.recordings.files.tables import quiet_read
 
 SIZE = (320, 240)
 Rows = list[tuple[float, int, int, int]]
@@ -29,15 +29,6 @@ def text(path: Path, events: np.ndarray, form="{:.6f}", unit=1e-6, head="320 240
     lines = [comma.join(map(str, row)) for row in rows]
     path.write_text("\n".join([head, *lines]) + "\n")
     return path
-
-
-def quiet_read(path: Path, **options) -> np.ndarray:
-    """Return the events; a warning is an error."""
-    import warnings
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        return read_events(path, options=ReadOptions(**options))
 
 
 @pytest.mark.parametrize("first", [0, 1])
@@ -197,32 +188,6 @@ def test_reported_files_hold_the_scene(shared_data, name):
     found["t"] += before_us
     assert len(good) == 1500
     assert np.array_equal(np.sort(found), np.sort(good))
-
-
-@pytest.mark.parametrize(("unit", "scale"), [("ms", 1e-3), ("ns", 1e3), ("us", 1.0), ("s", 1e-6)])
-def test_a_unit_in_the_name_of_the_times_holds_in_every_table(tmp_path, unit, scale):
-    """Times of a sparse recording, finer than a microsecond, from which it cannot be told."""
-    events, name = scene(), f"t_{unit}"
-    columns = {name: events["t"] * 100 * scale + 1e-7} | {key: events[key] for key in "xyp"}
-    kinds = [(key, column.dtype) for key, column in columns.items()]
-    table = np.array(list(zip(*columns.values(), strict=True)), kinds)
-    np.savez(tmp_path / "a.npz", **columns)
-    np.savez(tmp_path / "b.npz", events=table)
-    np.save(tmp_path / "a.npy", table)
-    with h5py.File(tmp_path / "a.h5", "w") as file:
-        for key, column in columns.items():
-            file[f"events/{key}"] = column
-    for path in ("a.npz", "b.npz", "a.npy", "a.h5"):
-        assert np.array_equal(quiet_read(tmp_path / path)["t"], events["t"] * 100), path
-
-
-def test_a_stated_unit_is_obeyed_before_one_in_a_name(tmp_path):
-    events = scene()
-    columns = {"t_ms": events["t"] * 1e-3} | {key: events[key] for key in "xyp"}
-    np.savez(tmp_path / "a.npz", **columns)
-    with pytest.warns(UserWarning, match="times in s give 200 s"):
-        found = read_events(tmp_path / "a.npz", options=ReadOptions(time_unit="s"))
-    assert np.array_equal(found["t"], events["t"] * 1000)
 
 
 @pytest.mark.parametrize("kind", [np.uint32, np.int32])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from src.recordings.files import ReadOptions, read_events
-from tests.recordings.files.test_tables import assert_read, events, lines
+from tests.recordings.files.test_table_forms import assert_read, events, lines
 
 __all__ = ["events"]  # a fixture
 
