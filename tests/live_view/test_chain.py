@@ -554,7 +554,7 @@ def test_loads_are_cpu_time_not_waits(recording):
     made = served(recording, {"waiting": Waiting()}, max_waiting_windows=4)
     player = made.page.player
     player.start()
-    _until(lambda: player.frames.count >= 5)
+    until(lambda: player.frames.count >= 5)
     player.stop()
     assert player.meters.busy_s["network"] < 0.05 * player.frames.count / 2
 
