@@ -16,7 +16,7 @@ from tests.deploy.conftest import form
 
 pytestmark = pytest.mark.usefixtures("unchecked")
 EXACT = 1e-5
-WINDOWS = 10
+WINDOWS = 20
 FORMS = ["float32", "openvino"]
 QUIET, ALONE, BLOB, EVERYWHERE = "quiet", "alone", "blob", "everywhere"
 
