@@ -8,6 +8,7 @@ from pathlib import Path
 import jaxtyping
 import pytest
 import torch
+from hydra.core.hydra_config import HydraConfig
 
 import src  # noqa: F401 - sets OpenCV's limits before a test imports it
 from tests.faults.harness import leave_slices_out
@@ -50,6 +51,13 @@ def no_slices():
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr("src.figures.samples.draw_comparison", leave_slices_out)
         yield
+
+
+@pytest.fixture(autouse=True)
+def no_hydra_left():
+    """What a test began by Hydra in this process is not what the next is run by."""
+    yield
+    HydraConfig.instance().cfg = None
 
 
 @pytest.fixture(scope="session")

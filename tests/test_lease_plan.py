@@ -125,7 +125,7 @@ def test_a_file_that_is_no_plan_is_refused(changes, said, tmp_path):
 def test_yaml_that_is_none_is_refused_in_one_line(text, tmp_path):
     path = tmp_path / "plan.yaml"
     path.write_text(text)
-    for read in (plans.load_plan, lambda file: gather_files(tmp_path / "all", file, {}, 1)):
+    for read in (plans.load_plan, lambda file: gather_files(tmp_path / "all", file, {})):
         with pytest.raises(ValueError, match="plan.yaml must be as conf/lease/default.yaml is"):
             read(path)
 
