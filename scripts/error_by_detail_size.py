@@ -9,6 +9,7 @@ area that stays grey is missing at 16 pixels and more; LPIPS and SSIM hardly see
 """
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -50,22 +51,27 @@ def _scales(x: Tensor) -> list[Tensor]:
 
 
 @torch.no_grad()
-def measure(cfg: DictConfig, name: str) -> Float[Tensor, " scales"]:
-    """Return the mean of `missing` over the clips, of the network that `name` stands for.
+def measure(cfg: DictConfig, names: Sequence[str]) -> dict[str, Float[Tensor, " scales"]]:
+    """Return the mean of `missing` over the clips, of each network that one of `names` stands for;
+    those of the same views are given the same clips.
 
     Raises ValueError for what is no network for events and for photographs that are none.
     """
-    network = load_network_of_kind(VideoMethod, cfg, name, "CKPT must be a network")
-    optics = simulation.select_optics(cfg, network)
+    wanted = "CKPT must be a network"
+    networks = {name: load_network_of_kind(VideoMethod, cfg, name, wanted) for name in names}
+    optics = {name: simulation.select_optics(cfg, one) for name, one in networks.items()}
     try:
-        pipeline, rows = simulation.build_pipeline(cfg, "val", optics), []
+        pipelines = {one: simulation.build_pipeline(cfg, "val", one) for one in optics.values()}
     except ValueError as error:
         raise ValueError(str(error).replace("scene.root", "--root")) from error
+    rows: dict[str, list[Tensor]] = {name: [] for name in names}
     for clip in range(CLIPS):
-        sample = simulate(pipeline, [clip])
-        frames = network.reconstruct_clip(sample)[0, WARMUP:]
-        rows.append(missing(frames, sample.target[0, WARMUP:]))
-    return torch.stack(rows).mean(0)
+        samples = {one: simulate(pipeline, [clip]) for one, pipeline in pipelines.items()}
+        for name, network in networks.items():
+            sample = samples[optics[name]]
+            frames = network.reconstruct_clip(sample)[0, WARMUP:]
+            rows[name].append(missing(frames, sample.target[0, WARMUP:]))
+    return {name: torch.stack(row).mean(0) for name, row in rows.items()}
 
 
 def main() -> None:
@@ -76,7 +82,7 @@ def main() -> None:
     given = parser.parse_args()
     cfg = compose_config("train", "experiment=lf3x3", "budget=hours", f"data.test_crop={SIDE}")
     cfg.scene.root = str(given.root) if given.root else None
-    means = {name: measure(cfg, name) for name in given.ckpts}
+    means = measure(cfg, given.ckpts)
     print("| pixels | " + " | ".join([f"< {side}" for side in SIDES] + [f"> {SIDES[-1]}"]) + " |")
     print("|---" * (len(SIDES) + 2) + "|")
     for name, row in means.items():

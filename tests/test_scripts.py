@@ -334,12 +334,12 @@ def test_a_network_gets_the_views_that_it_wants_and_photographs_are_named(tmp_pa
     monkeypatch.setattr(error_by_detail_size, "CLIPS", 1)
     small = ["data.test_windows=12", "data.test_crop=176", "turbulence=none"]
     cfg = config("train", tmp_path, *small)
-    assert float(measure(cfg, "single256").min()) > 0
+    assert float(measure(cfg, ["single256"])["single256"].min()) > 0
     with pytest.raises(ValueError, match="CKPT must be a network for events, mambatm is none"):
-        measure(cfg, "mambatm")
+        measure(cfg, ["mambatm"])
     cfg.scene.root = "/nowhere"
     with pytest.raises(ValueError, match="^--root must be .*/nowhere"):
-        measure(cfg, "single256")
+        measure(cfg, ["single256"])
 
 
 def test_the_table_of_psfs_is_written_whole_and_once(tmp_path, monkeypatch):

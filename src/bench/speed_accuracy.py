@@ -103,6 +103,11 @@ def find_pareto_front(costs_and_errors: Mapping[Name, tuple[float, float]]) -> l
     return names
 
 
+def compute_standard_error(values: Sequence[float]) -> float:
+    """Return the standard error of the mean of two values or more."""
+    return statistics.stdev(values) / math.sqrt(len(values))
+
+
 def select_by_one_standard_error(
     costs: Mapping[str, float], errors: Mapping[str, Sequence[float]]
 ) -> str:
@@ -114,8 +119,7 @@ def select_by_one_standard_error(
 
     def is_near(values: Sequence[float]) -> bool:
         more = [ours - least for ours, least in zip(values, errors[best], strict=True)]
-        spread = statistics.stdev(more) / math.sqrt(len(more))
-        return statistics.fmean(more) <= spread
+        return statistics.fmean(more) <= compute_standard_error(more)
 
     return min((name for name in errors if is_near(errors[name])), key=costs.__getitem__)
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from statistics import stdev
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,12 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from matplotlib.transforms import Bbox
 
 from src.bench.speed import SpeedMeasurement
-from src.bench.speed_accuracy import ClipScore, find_fastest_forms, find_pareto_front
+from src.bench.speed_accuracy import (
+    ClipScore,
+    compute_standard_error,
+    find_fastest_forms,
+    find_pareto_front,
+)
 from src.figures.plots import save_figure
 from src.metrics.table import METRICS, Column, mean_score
 
@@ -67,7 +71,7 @@ def _draw_metric(
 ) -> dict[str, Span]:  # fmt: skip
     """Draw the panel of `metric`, all but names; return where each network is."""
     spans: dict[str, Span] = {}
-    errors_of_difference = compute_errors_of_difference(metric, scores)
+    standard_errors = compute_standard_errors(metric, scores)
     for name, fastest in timed.items():
         values = [score.values[metric.name] for score in scores if score.network == name]
         mean = mean_score(values)
@@ -76,7 +80,7 @@ def _draw_metric(
             spans[name] = least, fastest.ms, mean
             line, colour = ([least, fastest.ms], [spans[name][2]] * 2), _colour(fastest)
             axes.plot(*line, "o-", markevery=[1], color=colour, lw=1.2)
-            error = errors_of_difference.get(name, 0.0)
+            error = standard_errors.get(name, 0.0)
             if error > 0:
                 axes.vlines(fastest.ms, mean - error, mean + error, color=colour, lw=0.8)
     errors = {key: (ms, -metric.better * score) for key, (_, ms, score) in spans.items()}
@@ -93,7 +97,7 @@ def _draw_metric(
     return spans
 
 
-def compute_errors_of_difference(metric: Column, scores: Sequence[ClipScore]) -> dict[str, float]:
+def compute_standard_errors(metric: Column, scores: Sequence[ClipScore]) -> dict[str, float]:
     """Return {network: standard error of its mean difference of `metric` to the best network's},
     over the clips of both; none where they are fewer than two.
     """
@@ -109,7 +113,7 @@ def compute_errors_of_difference(metric: Column, scores: Sequence[ClipScore]) ->
     for name, own in values.items():
         more = [own[clip] - best[clip] for clip in own.keys() & best.keys()]
         if len(more) > 1:
-            found[name] = stdev(more) / len(more) ** 0.5
+            found[name] = compute_standard_error(more)
     return found
 
 

@@ -49,7 +49,7 @@ class FrameRing:
         self.pushed_s[self.count % len(self.ring)] = time.perf_counter()
         self.count += 1
 
-    def length_s(self) -> float | None:
+    def measure_length_s(self) -> float | None:
         """Return the wall time from the oldest to the newest frame of the ring in seconds; None of
         fewer than two."""
         pushed_s = self.pushed_s[: self.count].copy()

@@ -78,7 +78,7 @@ class LivePage:
 
     def status(self) -> dict:
         """Return the meters, and what is chosen and offered."""
-        status, slice_s = self.player.status(), self.frames.length_s()
+        status, slice_s = self.player.status(), self.frames.measure_length_s()
         return status | {
             "line": self.slice.line,
             "slice_s": None if slice_s is None else round(slice_s, 2),

@@ -59,7 +59,7 @@ def test_bars_are_the_error_of_the_difference_to_the_best(tmp_path, monkeypatch)
         for clip, value in enumerate(row)
     ]
     (metric,) = (metric for metric in frontier.DRAWN if metric.name == "psnr_aligned")
-    found = frontier.compute_errors_of_difference(metric, scores)
+    found = frontier.compute_standard_errors(metric, scores)
     assert found == pytest.approx({"best": 0.0, "less": 1 / 3**0.5})
     drawn = []
     monkeypatch.setattr(frontier, "save_figure", lambda figure, path: drawn.append(figure) or path)

@@ -309,7 +309,7 @@ def test_the_length_of_the_slice_is_the_wall_time_of_its_frames(monkeypatch):
     for now in (10.0, 10.5, 11.0, 14.0, 14.25, 14.5):
         monkeypatch.setattr(frame_buffer.time, "perf_counter", lambda now=now: now)
         frames.push(np.zeros((8, 8), np.float32))
-        lengths.append(frames.length_s())
+        lengths.append(frames.measure_length_s())
     assert lengths == [None, 0.5, 1.0, 4.0, 3.75, 3.5]
 
 

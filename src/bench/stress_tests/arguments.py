@@ -1,4 +1,4 @@
-"""What the arguments of stress tests may be, told before any of them runs; titles with them."""
+"""The arguments of stress tests, checked before any of them runs, and titles that name them."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields

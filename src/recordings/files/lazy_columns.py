@@ -42,7 +42,10 @@ def split_table(table: Any, order: str | None) -> dict[str, Any]:
     and (n, 1), as MATLAB has them.  Raises ValueError for another array."""
     names = table.dtype.names
     if isinstance(table, np.ndarray):
-        table = flat_column(table) if names else table.T if has_event_per_column(table) else table
+        if names is not None:
+            table = flatten_column(table)
+        elif has_event_per_column(table):
+            table = table.T
     if names is not None:
         keys = find_keys_by_name(names) if order is None else _name_fields(names, order)
         if order is None:
@@ -81,7 +84,7 @@ def has_event_per_column(table: Any) -> bool:
     return table.ndim == 2 and table.shape[0] == 4 and table.shape[1] >= LEAST_COLUMNS
 
 
-def flat_column(column: np.ndarray) -> np.ndarray:
+def flatten_column(column: np.ndarray) -> np.ndarray:
     """Return (n, 1) or (1, n), as MATLAB has columns, as (n,); others as they are."""
     return column.ravel() if column.ndim == 2 and 1 in column.shape else column
 

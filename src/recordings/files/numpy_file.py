@@ -31,7 +31,7 @@ from src.recordings.files.event_file import (
     require_default_stream,
 )
 from src.recordings.files.lazy_columns import (
-    flat_column,
+    flatten_column,
     has_event_per_column,
     slice_columns,
     slice_times,
@@ -124,7 +124,7 @@ def _columns_of(
         require_default_stream(path, options.stream)
         refuse_column_order(options.columns, "the arrays in it have names")
         columns = {
-            name: flat_column(extract_column(name, key, file[key])) for name, key in keys.items()
+            name: flatten_column(extract_column(name, key, file[key])) for name, key in keys.items()
         }
         if any(column.ndim != 1 for column in columns.values()):
             raise ValueError("columns must have one dimension")
