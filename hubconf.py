@@ -11,7 +11,7 @@ are float32 and in eval mode.  What each was trained and tested on: weights/<nam
 
 from torch import nn
 
-from src import models
+from src.models import files
 
 dependencies = ["torch", "numpy", "jaxtyping", "safetensors"]
 
@@ -22,29 +22,29 @@ def setnet_small() -> nn.Module:
     Takes `window_s`, the length of a window in seconds (1/120), and `positions`, the (row, col) of
     every view.
     """
-    return models.load("setnet_small")
+    return files.load("setnet_small")
 
 
 def setnet_medium() -> nn.Module:
     """As `setnet_small`, 1.2 GMAC."""
-    return models.load("setnet_medium")
+    return files.load("setnet_medium")
 
 
 def setnet_large() -> nn.Module:
     """As `setnet_small`, 3.5 GMAC."""
-    return models.load("setnet_large")
+    return files.load("setnet_large")
 
 
 def lf3x3() -> nn.Module:
     """E2VID with the nine views of a 3x3 light field stacked, row by row (the paper's)."""
-    return models.load("lf3x3")
+    return files.load("lf3x3")
 
 
 def single256() -> nn.Module:
     """E2VID of one view, trained through turbulence (the paper's baseline)."""
-    return models.load("single256")
+    return files.load("single256")
 
 
 def network(name: str) -> nn.Module:
     """The network of a name in weights/, such as clean/etnet, or of a path; ValueError for none."""
-    return models.load(name)
+    return files.load(name)

@@ -18,7 +18,7 @@ from benchmarks.runtime import milliseconds
 from src.app.script import positive_number, run_script, whole_number
 from src.deploy.runtime import EventListRuntime, fastest_form
 from src.figures import plots
-from src.models import load
+from src.models.files import load
 from src.sim.optics import layout
 
 TILE_PX, EVENTS = 32, 300  # side of a tile, events in each over all views

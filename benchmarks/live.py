@@ -17,7 +17,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-import src.models
 from benchmarks.recordings import MODEL, SENSOR, events
 from src.app.script import positive_number, run_script, whole_number
 from src.live import GIL_SWITCH_S, assemble_server
@@ -25,6 +24,7 @@ from src.live_view import event_feeds
 from src.live_view.network_runner import RunSettings
 from src.live_view.page_server import PageServer
 from src.live_view.status import FaultLog
+from src.models import files
 from src.recordings import sensor_lookup
 from src.recordings.files import event_writers
 from src.recordings.simulated_recording import kaleidoscope_views
@@ -96,7 +96,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "uniform.raw"
         write(path, views)
-        networks = {asked.ckpt: src.models.load(asked.ckpt)}
+        networks = {asked.ckpt: files.load(asked.ckpt)}
         how = RunSettings(asked.fps, form=asked.form)
         feed = event_feeds.open_feed(str(path), None, faults, loop=True)
         server = assemble_server(feed, networks, views, how, faults, port=PORT)

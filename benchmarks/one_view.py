@@ -27,7 +27,7 @@ from src.deploy.cost import torch_threads
 from src.deploy.cpu_features import is_bf16_faster
 from src.deploy.forms import convert_to_form
 from src.deploy.runtime import EventListRuntime, fastest_form
-from src.models import load
+from src.models.files import load
 from src.recordings.files.recording import read_events
 
 FPS, EVENTS_PER_PIXEL, WINDOWS, WARMUP = 120, 0.1, 3, 2

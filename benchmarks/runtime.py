@@ -27,7 +27,7 @@ from src.deploy.cost import count_macs, macs_per_frame, torch_threads
 from src.deploy.cpu_features import is_bf16_faster
 from src.deploy.forms import convert_to_form
 from src.deploy.runtime import EventListRuntime
-from src.models import load
+from src.models.files import load
 from src.recordings.files.recording import read_events
 from src.sim.optics import layout
 

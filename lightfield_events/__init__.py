@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from src.deploy.forms import convert_to_form
     from src.deploy.onnx_export import OnnxNetwork, export_onnx
     from src.deploy.runtime import EventListRuntime as Runtime
-    from src.models import load
+    from src.models.files import load
     from src.recordings.files import ReadOptions, read_events
     from src.recordings.output import write_video
     from src.recordings.views import Views, load_views
@@ -29,7 +29,7 @@ _HOMES = {  # of each name: its module, and there its name
     "convert_to_form": "src.deploy.forms.convert_to_form",
     "export_onnx": "src.deploy.onnx_export.export_onnx",
     "layout": "src.sim.optics.layout",
-    "load": "src.models.load",
+    "load": "src.models.files.load",
     "load_views": "src.recordings.views.load_views",
     "read_events": "src.recordings.files.read_events",
     "simulate": "src.app.python_interface.simulate",

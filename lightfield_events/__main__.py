@@ -14,7 +14,7 @@ COMMANDS = (
 def main() -> None:
     """Run `src.<command>` with the rest of the command line."""
     import src
-    from src.app.help import show_help
+    from src.app.before_imports import answer_before_imports
 
     src.shorten_interruption()
     name = sys.argv[1] if len(sys.argv) > 1 else "--help"
@@ -27,8 +27,7 @@ def main() -> None:
         sys.exit(1)
     file = str(Path(src.__path__[0]) / f"{name}.py")
     sys.argv[:2] = [file]
-    if show_help(name, Path(file)):
-        return
+    answer_before_imports(name, Path(file))
     run_module(f"{src.__name__}.{name}", run_name="__main__", alter_sys=True)
 
 

@@ -30,14 +30,14 @@ from jaxtyping import Float
 from omegaconf import OmegaConf
 
 from src.app.script import run_script
-from src.recordings.calibration import turbulence_meter
-from src.recordings.calibration.tilt_covariance import find_first_fall
-from src.recordings.calibration.turbulence_meter import TurbulenceMeasurement
 from src.recordings.files.turbulence_file import (
     IntervalEstimate,
     MeasuredTurbulence,
     TurbulenceFile,
 )
+from src.recordings.turbulence_measurement import turbulence_meter
+from src.recordings.turbulence_measurement.tilt_covariance import find_first_fall
+from src.recordings.turbulence_measurement.turbulence_meter import TurbulenceMeasurement
 from src.sim.turbulence.atmosphere import AR1_FPS, Atmosphere
 from src.sim.turbulence.operator import Turbulence
 from src.sim.turbulence.prior import TargetImageStatistics, log_uniform, sample_matching_atmosphere

@@ -20,7 +20,6 @@ from omegaconf import DictConfig
 from torch import Tensor
 
 from scripts.ship_weights import CARD_NOTE
-from src import models
 from src.app import simulation
 from src.app.compose import compose_config
 from src.app.instantiate import build_part
@@ -126,7 +125,7 @@ def baseline_overrides(name: str, published: Path | None) -> list[str]:
 def load_shipped(name: str, views: int, published: Path | None = None) -> Candidate:
     """Return a shipped network, or one of BASELINES with its weights in the folder `published`."""
     if name not in BASELINES:
-        return Candidate(name, models.load(name), views)
+        return Candidate(name, files.load(name), views)
     cfg = compose_config("eval", *baseline_overrides(name, published))
     return Candidate(name, build_part(cfg, "baseline").eval(), views)
 

@@ -34,16 +34,16 @@ def _show_exception(
         sys.__excepthook__(kind, error, trace)
 
 
-def _show_help() -> None:
-    """Print the help of `python -m src.<name> --help` and end, before seconds of imports."""
-    from src.app.help import show_help
+def _answer_before_imports() -> None:
+    """End `python -m src.<name>` where it asks for help or is wrong, before seconds of imports."""
+    from src.app.before_imports import answer_before_imports
 
     package, _, name = sys.orig_argv[-len(sys.argv)].rpartition(".")
     file = Path(__file__).with_name(f"{name}.py")
-    if package == "src" and file.is_file() and show_help(name, file):
-        sys.exit()
+    if package == "src" and file.is_file():
+        answer_before_imports(name, file)
 
 
 if sys.argv[:1] == ["-m"]:  # while Python looks for the module of `python -m src.<name>`
     shorten_interruption()
-    _show_help()
+    _answer_before_imports()

@@ -21,18 +21,16 @@ from src.recordings import event_windows, reconstruction, sensor_lookup
 from src.recordings.calibration import (
     activity_pictures,
     contrast_threshold,
-    dot_statistics,
-    gaussian_dots,
     scene_alignment,
-    turbulence_meter,
     view_alignment,
 )
 from src.recordings.calibration.boards import Target, check_grid_size
-from src.recordings.calibration.gaussian_dots import GaussianFits
 from src.recordings.files import recording_inputs, videos
 from src.recordings.files.event_file import ReadOptions
 from src.recordings.files.recording import open_recording
 from src.recordings.files.turbulence_file import SIDE
+from src.recordings.turbulence_measurement import dot_statistics, gaussian_dots, turbulence_meter
+from src.recordings.turbulence_measurement.gaussian_dots import GaussianFits
 from src.recordings.views import Views, load_views
 from src.records import results
 from src.records.atomic import check_writable, write_text

@@ -8,8 +8,8 @@ import torch
 from baselines.mambatm import MambaTM
 from src.app.compared_networks import load_candidates
 from src.chart import draw_speed_accuracy_chart
-from src.models import save
 from src.models.e2vid import E2VID
+from src.models.files import save
 from tests.test_train import config
 
 HIGHPASS = "{baseline: {_target_: baselines.highpass.HighPass}, views: 1}"

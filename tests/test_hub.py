@@ -5,7 +5,7 @@ import sys
 
 import torch
 
-from src import models
+from src.models import files
 from tests.conftest import ROOT
 
 CODE = """
@@ -31,7 +31,7 @@ def test_the_shipped_networks_are_loaded_from_anywhere(tmp_path):
     subprocess.run(run, cwd=tmp_path, check=True, capture_output=True, timeout=600)
     found = torch.load(tmp_path / "out.pt", weights_only=True)
     for name, frame in zip(NAMES, found, strict=True):
-        network = models.load(name)
+        network = files.load(name)
         torch.manual_seed(0)
         with torch.no_grad():
             shown, _ = network(torch.randn(1, network.views or 9, 5, 16, 16), None)

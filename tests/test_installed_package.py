@@ -14,8 +14,8 @@ import pytest
 import lightfield_events
 import lightfield_events.__main__
 from setup import rename_imports
-from src import models
 from src.deploy.runtime import EventListRuntime
+from src.models import files
 from tests.conftest import ROOT
 
 USE = """
@@ -75,7 +75,7 @@ def check_package(place: Path, folder: Path, compiled: bool) -> None:
     command = [sys.executable, "-W", "ignore", "-c", USE, str(place), "events.npy"]
     subprocess.run(command, cwd=folder, env=environment, check=True, timeout=600)
     with np.load(folder / "out.npz") as found:
-        net, columns = models.load("setnet_small"), [events[name] for name in COLUMNS]
+        net, columns = files.load("setnet_small"), [events[name] for name in COLUMNS]
         columns[0] = columns[0] * 1e-6
         size = {"height": 24, "width": 32, "form": "float32", "threads": 1}
         runtime = EventListRuntime(net, positions=lightfield_events.layout(9), **size)

@@ -21,7 +21,7 @@ from src.reconstruct import reconstruct
 from src.simulate import simulate
 from src.train import train
 from tests.conftest import ROOT
-from tests.recordings.calibration.test_turbulence_meter import fields, film
+from tests.recordings.turbulence_measurement.test_turbulence_meter import fields, film
 from tests.test_recording_entry_points import folder  # noqa: F401 - a fixture
 from tests.test_sweeps import jobs
 from tests.test_train import TINY

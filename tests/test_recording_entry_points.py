@@ -17,7 +17,7 @@ from src.calibrate import TASKS, calibrate, describe_resolution
 from src.compare import compare, default_video_names
 from src.figures import comparison
 from src.live import build_server
-from src.models import load
+from src.models.files import load
 from src.reconstruct import describe_run, reconstruct, show_progress, suggest_faster_form
 from src.recordings import reconstruction, sensor_lookup, simulated_recording, truth_file, views
 from src.recordings.files import read_events

@@ -7,11 +7,11 @@ from typing import cast
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from torch import nn
 
-import src.models
 from baselines.postprocess import load_postprocessor
 from src.app.instantiate import as_dict, build_part, instantiate_node, read_user_packages
 from src.app.simulation import build_pipeline
 from src.bench.candidates import Candidate
+from src.models.files import load
 from src.models.network import EventToVideoNetwork
 from src.sim.pipeline import Pipeline
 
@@ -30,7 +30,7 @@ def load_candidates(cfg: DictConfig) -> list[Candidate]:
     given = cfg.ckpt if isinstance(cfg.ckpt, ListConfig) else [cfg.ckpt] if cfg.ckpt else []
     files = list(dict.fromkeys(map(str, given)))
     shown = zip(_name_networks(files), files, strict=True)
-    loaded = {name: src.models.load(file, packages) for name, file in shown}
+    loaded = {name: load(file, packages) for name, file in shown}
     if cfg.get("baseline"):
         name = str(cfg.baseline.get("architecture", "baseline"))
         name = f"baseline {name}" if name in loaded else name
@@ -60,7 +60,7 @@ def _load_entry(name: str, entry: Mapping, packages: Sequence[str], bins: int) -
         if "postprocessor" in entry:
             post = load_postprocessor(entry["postprocessor"], packages)
         if "ckpt" in entry:
-            network = src.models.load(entry["ckpt"], packages)
+            network = load(entry["ckpt"], packages)
         elif "baseline" in entry:
             network = instantiate_node(entry["baseline"], packages).eval()
     except ValueError as error:

@@ -18,7 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from src.app.path_overrides import is_path_key
 from src.app.renamed_keys import describe_unknown_key, flatten_keys
-from src.models.files import MAX_SIZE
+from src.models.size_limit import MAX_SIZE
 from src.recordings.sensor_limits import LARGEST_SIDE, are_sensor_sides
 
 NUMBER, WHOLE, WORD, FLAG = "a number", "a whole number", "a word", "true or false"

@@ -6,7 +6,7 @@ import re
 import sys
 import warnings
 from pathlib import Path
-from typing import TextIO
+from typing import NoReturn, TextIO
 
 SOURCE = Path(__file__).parents[1]
 NEAREST = {"…": "..."} | dict(zip("•—–━╸╺↑↓", "*-----^v", strict=True))
@@ -26,6 +26,12 @@ def print_replaced_path(path: Path) -> None:
     if path.exists():
         held = f", {len(list(path.iterdir()))} files," if path.is_dir() else ""
         print(f"{path}{held} is there and will be replaced")
+
+
+def exit_with_error(message: str, code: int = 2) -> NoReturn:
+    """Print `message` in one line on stderr and end the process with exit code `code`."""
+    print("error: " + " ".join(message.split()), file=sys.stderr)
+    sys.exit(code)
 
 
 def cut_worker_traceback(message: str) -> str:

@@ -102,9 +102,8 @@ def run_main(main: Callable[[], None]) -> None:
             wanted = "hydra.run.dir must be a folder, new or there"
             error = ValueError(f"{wanted}, got {error.filename}: {why}")
         message = describe_config_error(error, Path(sys.argv[0]).stem)
-        print(f"error: {message}", file=sys.stderr)
         is_io = isinstance(error, OSError) and not isinstance(error, HydraException)
-        sys.exit(1 if is_io else 2)  # 1: a full disk, a file that may not be read
+        console.exit_with_error(message, 1 if is_io else 2)  # 1: a full disk, an unreadable file
     except _stop_errors() as error:
         interrupted = isinstance(error, KeyboardInterrupt)
         print("stopped", file=sys.stderr)

@@ -6,8 +6,8 @@ from typing import TypeVar
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-import src.models
 from src.app.instantiate import build_part, read_user_packages
+from src.models import files
 from src.models.backward_warmup import BackwardWarmup
 from src.models.network import VideoMethod
 
@@ -20,7 +20,7 @@ def load_network_of_kind(
     """Return the network of `weights`, a file or a name as of `ckpt`; ValueError where it is not
     there or no `kind`."""
     try:
-        network = src.models.load(weights, read_user_packages(cfg))
+        network = files.load(weights, read_user_packages(cfg))
     except ValueError as error:
         raise ValueError(f"{error_prefix}: {error}") from error
     if not isinstance(network, kind):
@@ -33,7 +33,7 @@ def load_ckpt_or_baseline(cfg: DictConfig) -> VideoMethod:
     if cfg.ckpt and cfg.get("baseline"):
         raise ValueError(f"ckpt must be null with baseline=..., got {cfg.ckpt}")
     if cfg.ckpt:
-        net = src.models.load(cfg.ckpt, read_user_packages(cfg))
+        net = files.load(cfg.ckpt, read_user_packages(cfg))
         if not isinstance(net, VideoMethod):
             use = f"baseline=frames postprocess=mambatm postprocess.postprocessor={cfg.ckpt}"
             how = f"; use {use}" if "postprocess" in cfg else " of frames"

@@ -6,6 +6,8 @@ import signal
 import sys
 from collections.abc import Callable
 
+from src.app import console
+
 
 def run_script(main: Callable[[], None]) -> None:
     """Call `main`; a wrong value ends in one line on stderr and exit code 2.
@@ -15,8 +17,7 @@ def run_script(main: Callable[[], None]) -> None:
     try:
         main()
     except (ValueError, OSError) as error:
-        print("error: " + " ".join(str(error).split()), file=sys.stderr)
-        sys.exit(1 if isinstance(error, OSError) else 2)
+        console.exit_with_error(str(error), 1 if isinstance(error, OSError) else 2)
     except KeyboardInterrupt:
         sys.exit(128 + signal.SIGINT)
 

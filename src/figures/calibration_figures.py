@@ -11,10 +11,13 @@ from matplotlib.figure import Figure
 
 from src.figures.plots import save_figure
 from src.recordings.calibration.contrast_threshold import ThresholdEstimate
-from src.recordings.calibration.dot_statistics import DotStatistics, decay_time_s
-from src.recordings.calibration.turbulence_meter import TurbulenceMeasurement, longest_decay_frames
 from src.recordings.calibration.view_alignment import AlignedViews
 from src.recordings.files.turbulence_file import SIDE, IntervalEstimate
+from src.recordings.turbulence_measurement.dot_statistics import DotStatistics, decay_time_s
+from src.recordings.turbulence_measurement.turbulence_meter import (
+    TurbulenceMeasurement,
+    longest_decay_frames,
+)
 from src.recordings.views import Views
 from src.sim.optics import Position
 

@@ -21,13 +21,13 @@ from src import COMMAND, add_package_prefix
 from src.models.checkpoints import is_intact, newest_checkpoint
 from src.models.e2vid import E2VID
 from src.models.folding import fold_parametrizations, inference_copy
+from src.models.size_limit import MAX_SIZE
 from src.records.atomic import atomic_path
 
 WEIGHTS = Path(__file__).resolve().parents[2] / "weights"
 PACKAGES = ("src.models.", "baselines.")
 WIDENABLE = "src.models.e2vid.E2VID"  # goes on from its weights on one view
 POWER_ITERATIONS = 50
-MAX_SIZE = 4096  # any number in the arguments of a network of PACKAGES
 
 
 def load(name_or_path: str | Path, allowed_packages: Sequence[str] = ()) -> nn.Module:

@@ -1,9 +1,12 @@
 """A value of a wrong kind and a key that is none end in one line, before anything runs."""
 
+import sys
+
 import pytest
 from omegaconf import OmegaConf
 
 from src import simulate
+from src.app.before_imports import refuse_wrong_overrides
 from src.app.config_values import LIST, NULL, NUMBER, WORD, _kinds_like
 from tests.test_entry_points import run_here
 
@@ -85,7 +88,11 @@ WRONG = [
 
 @pytest.mark.parametrize(("name", "overrides", "said"), WRONG)
 def test_one_line_and_exit_code_2(name, overrides, said, tmp_path, capsys):
-    assert run_here(name, *overrides, f"paths.out={tmp_path}") == 2
+    words = [*overrides, f"paths.out={tmp_path}"]
+    with pytest.raises(SystemExit) as end:
+        refuse_wrong_overrides(name, words)
+        sys.exit(run_here(name, *words))
+    assert end.value.code == 2
     printed = capsys.readouterr()
     (line,) = printed.err.splitlines()
     assert line.startswith("error: ") and said in line and printed.out == ""

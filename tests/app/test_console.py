@@ -16,6 +16,7 @@ from lightning import Trainer
 from rich.console import Console
 
 from src.app import entry_point, help, methods
+from src.app.before_imports import refuse_wrong_overrides
 from src.app.help import help_text
 from src.records.results import ScoreRow, build_rich_score_table, describe_score_difference
 from src.training.progress import TrainingProgress
@@ -64,12 +65,32 @@ def test_every_command_has_help(command, capsys):
     assert "seed: 0  " in said and f"python -m src.{command}" in said
 
 
+def run_and_list_imports(*words: str) -> tuple[subprocess.CompletedProcess[str], set[str]]:
+    """Run `python -m` with `words`; return what it gave and the modules it imported."""
+    command = [sys.executable, "-X", "importtime", "-m", *words]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    return done, {line.rpartition("|")[2].strip() for line in done.stderr.splitlines()}
+
+
 def test_help_comes_before_the_imports_of_a_command():
-    command = [sys.executable, "-X", "importtime", "-m", "src.train", "--help"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    done, loaded = run_and_list_imports("src.train", "--help")
     assert done.stdout.startswith("Train a network") and "seed: 0  " in done.stdout
-    loaded = {line.rpartition("|")[2].strip() for line in done.stderr.splitlines()}
     assert "src.app.help" in loaded and not loaded & {"torch", "lightning", "hydra", "src.train"}
+
+
+@pytest.mark.parametrize("command", [["src.train"], ["lightfield_events", "train"]])
+def test_a_wrong_value_is_refused_before_the_imports_of_a_command(command):
+    done, loaded = run_and_list_imports(*command, "experiment=lf3x3", "width=abc")
+    assert done.returncode == 2
+    assert "error: width must be a whole number, got abc\n" in done.stderr
+    assert "hydra" in loaded and not loaded & {"torch", "lightning", "src.train"}
+
+
+def test_options_of_hydra_are_not_looked_at_before_imports():
+    refuse_wrong_overrides("train", ["width=1,2", "-m"])
+    refuse_wrong_overrides("simulate", ["--config-name", "demo", "write=a.raw"])
+    with pytest.raises(SystemExit):
+        refuse_wrong_overrides("train", ["width=1,2"])
 
 
 @pytest.mark.parametrize(

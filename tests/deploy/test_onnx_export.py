@@ -15,8 +15,8 @@ from baselines.pienet import PIENet
 from src.deploy import onnx_export
 from src.deploy.forms import Bf16Network, convert_to_form
 from src.deploy.onnx_export import OnnxNetwork, export_onnx
-from src.models import load
 from src.models.e2vid import E2VID
+from src.models.files import load
 from src.models.network import EventToVideoNetwork
 from src.models.setnet import SetNet
 

@@ -13,7 +13,6 @@ from torch.utils import _pytree as pytree
 from src.app import build
 from src.app.instantiate import instantiate_node
 from src.deploy.cost import macs_per_frame
-from src.models import load, save
 from src.models.background import BACKGROUND, BACKGROUND_WEIGHT, blend_background
 from src.models.cell_clock import (
     ACTIVITY_TAU_S,
@@ -24,6 +23,7 @@ from src.models.cell_clock import (
     STATIC_SHARE,
 )
 from src.models.context_pyramid import CONTEXT_TAU_S, smooth_context
+from src.models.files import load, save
 from src.models.network import MAX_WINDOWS, unroll
 from src.models.setnet import SIZES, SetNet
 from src.models.setnet_state import SetNetState

@@ -6,15 +6,16 @@ import pytest
 import torch
 
 from src.recordings import sensor_lookup, simulated_recording, views
-from src.recordings.calibration import dot_statistics, gaussian_dots, view_alignment
+from src.recordings.calibration import view_alignment
 from src.recordings.calibration.boards import Charuco, Checkerboard, Circles
 from src.recordings.files import event_writers, recording, recording_inputs
 from src.recordings.truth_file import create_truth_file
+from src.recordings.turbulence_measurement import dot_statistics, gaussian_dots
 from src.sim.optics import layout
 from src.sim.sensor.sensor import EventSensor
 from tests.recordings import pictures
-from tests.recordings.calibration.test_dot_statistics import sampling_error, series
 from tests.recordings.test_views import distance_px, split
+from tests.recordings.turbulence_measurement.test_dot_statistics import sampling_error, series
 
 SENSOR, SIDE, TILE = (360, 640), 120, 116.0
 VIEWS = [0, 1, 3, 4]  # mirrored both ways, in y, in x and not: the centre view

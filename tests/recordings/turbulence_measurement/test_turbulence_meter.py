@@ -8,9 +8,9 @@ import pytest
 
 from src.calibrate import calibrate, measure_turbulence_in_video
 from src.figures import calibration_figures
-from src.recordings.calibration import point_tracking, tilt_covariance, turbulence_meter
 from src.recordings.files import videos
 from src.recordings.files.turbulence_file import IntervalEstimate, read_turbulence_file
+from src.recordings.turbulence_measurement import point_tracking, tilt_covariance, turbulence_meter
 from tests.test_recording_entry_points import config
 
 SIDE, UNIT = 128, 256 / 128

@@ -16,9 +16,9 @@ from jaxtyping import Float, Int
 from scipy.spatial.distance import pdist
 
 from src.recordings.calibration.boards import Circles
-from src.recordings.calibration.gaussian_dots import GaussianFits
-from src.recordings.calibration.tilt_covariance import find_first_fall
 from src.recordings.calibration.view_alignment import repair_picture
+from src.recordings.turbulence_measurement.gaussian_dots import GaussianFits
+from src.recordings.turbulence_measurement.tilt_covariance import find_first_fall
 from src.records.atomic import write_text
 from src.records.results import format_csv
 

@@ -13,11 +13,19 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import gaussian_filter1d
 
-from src.recordings.calibration import tilt_covariance
-from src.recordings.calibration.camera_drift import remove_camera_drift
-from src.recordings.calibration.point_tracking import PointTracks, find_corners, track_points
-from src.recordings.calibration.tilt_covariance import CELLS, CovarianceModel, TiltStatistics
 from src.recordings.files.turbulence_file import ALLOWED, SIDE, IntervalEstimate, TurbulenceFile
+from src.recordings.turbulence_measurement import tilt_covariance
+from src.recordings.turbulence_measurement.camera_drift import remove_camera_drift
+from src.recordings.turbulence_measurement.point_tracking import (
+    PointTracks,
+    find_corners,
+    track_points,
+)
+from src.recordings.turbulence_measurement.tilt_covariance import (
+    CELLS,
+    CovarianceModel,
+    TiltStatistics,
+)
 
 SIZES = (512, 362, SIDE)  # pixels of the shorter side that is worked on: larger frames are shrunk
 MIN_TRACKED = 0.75  # of the corners, or the next smaller size is tried

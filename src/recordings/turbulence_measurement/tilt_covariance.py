@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.optimize import nnls
 
-from src.recordings.calibration.point_tracking import SPREAD, PointTracks
+from src.recordings.turbulence_measurement.point_tracking import SPREAD, PointTracks
 
 CELLS = 4  # a side: squares of the frame
 MIN_LENGTH_PX = 2.5  # the shortest Gaussian that is taken for tilt

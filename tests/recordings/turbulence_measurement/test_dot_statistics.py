@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from src.calibrate import calibrate
-from src.recordings.calibration import dot_statistics, gaussian_dots
+from src.recordings.turbulence_measurement import dot_statistics, gaussian_dots
 from tests.recordings.pictures import dot_grid
 from tests.test_recording_entry_points import config
 

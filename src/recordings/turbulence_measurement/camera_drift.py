@@ -11,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from src.recordings.calibration.point_tracking import PointTracks
-from src.recordings.calibration.tilt_covariance import centre_displacements
+from src.recordings.turbulence_measurement.point_tracking import PointTracks
+from src.recordings.turbulence_measurement.tilt_covariance import centre_displacements
 
 # Standard errors.  Of 40 simulated films without drift 0 to 3 pass, decay up to film / 8.
 SIGNIFICANT = 4.0

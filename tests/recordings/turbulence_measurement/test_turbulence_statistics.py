@@ -13,13 +13,13 @@ import torch
 
 from src.calibrate import measure_dot_statistics
 from src.recordings import sensor_lookup, simulated_recording
-from src.recordings.calibration import dot_statistics, gaussian_dots
+from src.recordings.turbulence_measurement import dot_statistics, gaussian_dots
 from src.sim import noise
 from src.sim.optics import layout
 from src.sim.turbulence.atmosphere import AR1_FPS, Atmosphere
 from src.sim.turbulence.operator import Turbulence
 from tests.recordings import pictures
-from tests.recordings.calibration.test_dot_statistics import sampling_error
+from tests.recordings.turbulence_measurement.test_dot_statistics import sampling_error
 from tests.test_recording_entry_points import config
 
 pytestmark = pytest.mark.slow  # 6480 pictures through turbulence
