@@ -7,16 +7,15 @@ from typing import Any
 import h5py
 import numpy as np
 
-from src.recordings.files.columns import (
+from src.recordings.files.column_names import (
     JOINT,
-    as_times,
-    check_lengths,
     extract_column,
     find_keys_by_name,
     find_time_column_names,
     find_time_unit_in_text,
     require_one_time_column,
 )
+from src.recordings.files.column_values import as_times, check_lengths
 from src.recordings.files.event_file import UNITS_US, ReadOptions, refuse_column_order
 from src.recordings.files.lazy_columns import LazyColumn, has_event_per_column, split_table
 

@@ -17,11 +17,8 @@ import h5py
 import hdf5plugin  # noqa: F401 - its codecs are registered by the import
 import numpy as np
 
-from src.recordings.files.columns import (
-    check_unpacking_ratio,
-    find_keys_by_name,
-    find_named_time_unit,
-)
+from src.recordings.files.column_names import find_keys_by_name, find_named_time_unit
+from src.recordings.files.column_values import check_unpacking_ratio
 from src.recordings.files.event_file import (
     EventFile,
     EventStream,

@@ -8,15 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from src.recordings.files.columns import (
-    as_integers,
-    as_times,
+from src.recordings.files.column_names import (
     extract_column,
-    find_columns,
     find_keys_by_name,
     find_time_column_names,
     require_one_time_column,
 )
+from src.recordings.files.column_values import as_integers, as_times, find_columns
 from src.recordings.files.event_file import PIECE_EVENTS, RawEvents, name_file_in_errors
 
 ENOUGH_EVENTS = 10_000  # of windows, that tell the order of columns or parts of pixels

@@ -8,16 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from src.recordings.files.columns import (
-    DATES,
-    check_lengths,
-    check_unpacking_ratio,
+from src.recordings.files.column_names import (
     extract_column,
     find_keys_by_name,
     find_named_time_unit,
     find_time_column_names,
     require_one_time_column,
 )
+from src.recordings.files.column_values import DATES, check_lengths, check_unpacking_ratio
 from src.recordings.files.event_file import (
     UNITS_US,
     EventFile,

@@ -15,14 +15,12 @@ import numpy as np
 from numpy.lib.recfunctions import structured_to_unstructured
 
 from src.recordings.engines.event_passes import MAX_COORDINATE
-from src.recordings.files.columns import (
-    as_integers,
-    check_unpacking_ratio,
-    find_columns,
+from src.recordings.files.column_names import (
     find_time_column_names,
     parse_time_column_unit,
     require_one_time_column,
 )
+from src.recordings.files.column_values import as_integers, check_unpacking_ratio, find_columns
 from src.recordings.files.event_file import (
     EventFile,
     RawEvents,

@@ -10,7 +10,7 @@ from itertools import pairwise
 from pathlib import Path, PureWindowsPath
 from typing import Any, NamedTuple
 
-from src.recordings.files.columns import (
+from src.recordings.files.column_names import (
     NAMES,
     SECONDS,
     find_candidate_columns,
