@@ -7,7 +7,7 @@ from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.utils.flop_counter import FlopCounterMode
+from torch.utils.flop_counter import FlopCounterMode, sdpa_flop_count
 
 from src.models.network import EventToVideoNetwork
 from src.sim.optics import Position
@@ -34,12 +34,23 @@ def macs_per_frame(
 
 
 def count_macs(work: Callable[[], object]) -> int:
-    """Return the multiply-accumulates of convolutions and matrix products in a call of `work`
-    (torch's FLOP counter, two FLOPs a MAC), without elementwise work and interpolation.
+    """Return the multiply-accumulates of convolutions and matrix products, those of attention
+    included, in a call of `work` (torch's FLOP counter, two FLOPs a MAC), on every device the same,
+    without elementwise work and interpolation.
     """
-    with FlopCounterMode(display=False) as counter:
+    with FlopCounterMode(display=False, custom_mapping=CPU_ATTENTION) as counter:
         work()
     return counter.get_total_flops() // 2
+
+
+def _count_attention_flops(
+    query: torch.Size, key: torch.Size, value: torch.Size, *_: Any, **__: Any
+) -> int:
+    return sdpa_flop_count(query, key, value)
+
+
+# The fused attention of a CPU, which torch's FLOP counter leaves out.
+CPU_ATTENTION = {torch.ops.aten._scaled_dot_product_flash_attention_for_cpu: _count_attention_flops}
 
 
 class Timing(NamedTuple):
