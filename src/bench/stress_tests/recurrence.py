@@ -117,11 +117,11 @@ def measure_flicker_recovery(
 def measure_static_scene_jitter_percent(
     network: Candidate, bench: StressBench, *, limit_percent: float, stop_after_share: float = 0.0
 ) -> StressResult:
-    """Return the temporal jitter of a static scene's video, in % of what turbulence does to one
-    view.
+    """Return the temporal jitter of a static scene's video, in % of that of one view's turbulent
+    frames.
 
     `stop_after_share`: the share of the clip in which the scene moves before it stops; at 0 all
-    events come from turbulence.  At 100 % the light of one view would be as steady.
+    events come from turbulence.  At 100 % one view's frames would be as steady.
     """
     shares = []
     for clip in bench.clips(ClipConditions(stop_after_share=stop_after_share)):
