@@ -158,6 +158,14 @@ def test_intervals_of_a_table_are_over_photographs_and_scores_that_clips_have():
     assert readme.format_means(gains[:2], METRICS[:1], "+") == ["+0.050"]
 
 
+def test_documents_have_the_rows_and_differences_of_their_tables():
+    for table in (table for tables in readme.TABLES.values() for table in tables):
+        name, text = table.section, (ROOT / table.document).read_text()
+        section = text.partition(f"<!-- report:{name} -->")[2].partition(f"<!-- end:{name} -->")[0]
+        rows = [line.split(" | ")[0].strip("| *") for line in section.splitlines() if " | " in line]
+        assert rows[1:] == [*table.rows, *table.pairs], f"{table.document}, {name}"
+
+
 def test_rows_of_published_networks_that_are_not_scored_again_stay():
     table = readme.Table("README.md", "results", (readme.PAPER, readme.FIRENET, readme.PIENET), {})
     scored = [{metric.name: 0.5 for metric in METRICS}]
