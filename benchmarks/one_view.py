@@ -1,7 +1,8 @@
 """One view of a whole sensor, from a list of events to a frame: python -m benchmarks.one_view
 
-Ours run from lists of events, the networks of conf/networks/published.yaml from a grid, each in the
-fastest of its forms: float32 and bf16 on PyTorch and, with the extra, OpenVINO.  Weights of the
+Ours run from lists of events, in the form that `src.deploy.runtime.fastest_form` names; the
+networks of conf/networks/published.yaml from a grid, each in the fastest of its forms: float32 and,
+where the processor is faster in it, bf16 on PyTorch and, with the extra, OpenVINO.  Weights of the
 latter are random: time does not depend on them.  Events are those of a real recording, its sensor
 scaled to the size, its clock set so that a window of 1/120 s has one event for ten pixels.  Wall
 time, the least of several windows: other jobs on the machine disturb it less than a median.
