@@ -8,6 +8,7 @@
 import asyncio
 import signal
 import sys
+import warnings
 from collections.abc import Mapping, Sequence
 from copy import copy
 
@@ -52,6 +53,8 @@ def build_server(cfg: DictConfig) -> PageServer:
     how = {"loop": cfg.loop, "udp_format": cfg.udp_format, "options": ReadOptions.from_keys(cfg)}
     how["in_views"] = None if cfg.views is None else load_views(cfg.views).sensor
     feed = open_feed(cfg.recording, cfg.sensor_size, faults, **how)
+    for message in feed.messages:
+        warnings.warn(message, stacklevel=2)
     views = views_or_whole_sensor(cfg.views, feed.sensor, cfg.resolution)
     networks = load_offered_networks(cfg, name, views.positions)
     settings = RunSettings(cfg.fps, cfg.bins, cfg.splat, cfg.window_length, cfg.form)

@@ -1,7 +1,9 @@
 """Where live events come from: a file, played; packets over UDP; a camera."""
 
+import errno
 import select
 import socket
+import sys
 import threading
 import time
 from abc import ABC, abstractmethod
@@ -24,6 +26,7 @@ GATHER_S = 0.002  # for which packets are gathered into one chunk
 GATHER_BYTES = 1 << 20
 MAX_PACKET_BYTES = 65536
 KERNEL_BUFFER_BYTES = 1 << 23  # asked of the kernel for packets that wait
+SO_MEMINFO, MEMINFO_WORDS, DROPS = 55, 9, 8  # of a Linux socket: uint32, the last its lost packets
 MAX_TIME_US = 2**53  # a time beyond is a broken packet
 RETRY_S = 1.0  # after which a lost camera is looked for again
 PACKETS = {  # of faery
@@ -33,10 +36,12 @@ PACKETS = {  # of faery
 
 
 class Feed(ABC):
-    """`is_live`: whether events come while they happen.  `sensor`: (height, width) in pixels."""
+    """`is_live`: whether events come while they happen.  `sensor`: (height, width) in pixels.
+    `messages`: what is said at the start."""
 
     is_live = True
     sensor: HeightWidth
+    messages: tuple[str, ...] = ()
 
     @abstractmethod
     def iter_event_chunks(self, stopped: threading.Event) -> Chunks:
@@ -110,17 +115,22 @@ class UdpFeed(Feed):
         self.sensor, self.packet_format, self.faults = sensor, packet_format, faults
         self.dtype = PACKETS[packet_format]
         self.buffer = memoryview(bytearray(GATHER_BYTES + MAX_PACKET_BYTES))
-        self.clock = TimestampUnwrapper()
-        try:
-            self.socket = _bind_udp_socket(url)
-        except (OSError, ValueError) as error:
-            raise ValueError(f"recording must be udp://address:port, got {url}: {error}") from None
+        self.clock = TimestampUnwrapper(is_live=True)
+        self.lost_packets = 0
+        self.socket = _bind_udp_socket(url)
+        granted = _granted_buffer_bytes(self.socket)
+        if granted < KERNEL_BUFFER_BYTES:
+            self.messages = (
+                f"the kernel's buffer for packets is {granted} bytes of {KERNEL_BUFFER_BYTES}: "
+                f"raise it with sysctl -w net.core.rmem_max={KERNEL_BUFFER_BYTES}",
+            )
 
     def iter_event_chunks(self, stopped: threading.Event) -> Chunks:
         """Yield what came, as soon as it came."""
         while not stopped.is_set():
             if select.select([self.socket], [], [], 0.1)[0]:
                 size = self._gather_packets()
+                self._report_lost_packets()
                 events = self.unpack(np.frombuffer(self.buffer[:size], self.dtype))
                 if events.size:
                     yield events, time.perf_counter()
@@ -134,7 +144,8 @@ class UdpFeed(Feed):
             except BlockingIOError:
                 break
             if received % self.dtype.itemsize:
-                self._report_bad_packets()
+                text = f"packets that are not {self.packet_format}: left out"
+                self.faults.report("packet", text, 1)
             else:
                 size += received
         return size
@@ -150,27 +161,63 @@ class UdpFeed(Feed):
             t, on, y = self.clock.unwrap(packed["t"]), packed["y"] & 1, packed["y"] >> 1
         is_valid = (t >= 0) & (t < MAX_TIME_US)
         if not is_valid.all():
-            self._report_bad_packets()
+            text = f"events with times that are not of {self.packet_format}: left out"
+            self.faults.report("invalid", text, int((~is_valid).sum()))
         return _as_events(t, packed["x"], y, on)[is_valid]
 
-    def _report_bad_packets(self) -> None:
-        self.faults.report("packet", f"packets that are not {self.packet_format}: left out")
+    def _report_lost_packets(self) -> None:
+        """Say how many packets found no room in the kernel's buffer."""
+        lost = count_lost_packets(self.socket)
+        if new := (lost - self.lost_packets) % 2**32:  # the kernel counts in 32 bits
+            text = "packets came faster than they are read, or net.core.rmem_max is too small"
+            self.faults.report("kernel", text, new)
+        self.lost_packets = lost
 
     def close(self) -> None:
         self.socket.close()
 
 
+def count_lost_packets(udp: socket.socket) -> int:
+    """Return how many packets found no room in the buffer of `udp`, modulo 2^32; 0 where the system
+    does not say (all but Linux)."""
+    if sys.platform != "linux":
+        return 0
+    try:
+        packed = udp.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, 4 * MEMINFO_WORDS)
+    except OSError:  # a kernel before 4.12
+        return 0
+    words = np.frombuffer(packed, np.uint32)
+    return int(words[DROPS]) if len(words) > DROPS else 0
+
+
+def _granted_buffer_bytes(udp: socket.socket) -> int:
+    """Return the bytes the kernel holds for packets that wait: Linux says twice as many."""
+    said = udp.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
+    return said // 2 if sys.platform == "linux" else said
+
+
 def _bind_udp_socket(url: str) -> socket.socket:
-    """Return a socket that packets to `url` arrive at; raises OSError or ValueError."""
-    parts = urlsplit(url)
-    if parts.port is None:
-        raise ValueError("no port")
-    family = socket.AF_INET6 if ":" in (parts.hostname or "") else socket.AF_INET
+    """Return a socket that packets to `url` arrive at; raises ValueError where there is none."""
+    try:
+        parts = urlsplit(url)
+        if parts.port is None:
+            raise ValueError("no port")
+        return _bind(parts.hostname or "", parts.port)
+    except (OSError, ValueError) as error:
+        is_taken = isinstance(error, OSError) and error.errno == errno.EADDRINUSE
+        reason = "another program listens there: end it or choose another port"
+        line = f"recording must be udp://address:port, got {url}: {reason if is_taken else error}"
+        raise ValueError(line) from None
+
+
+def _bind(host: str, port: int) -> socket.socket:
+    """Return a socket that packets to a port arrive at; raises OSError."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
     bound = socket.socket(family, socket.SOCK_DGRAM)
     try:
         bound.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, KERNEL_BUFFER_BYTES)
         bound.setblocking(False)
-        bound.bind((parts.hostname or "", parts.port))
+        bound.bind((host, port))
     except OSError:
         bound.close()
         raise

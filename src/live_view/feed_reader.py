@@ -9,7 +9,8 @@ import math
 import queue
 import threading
 import time
-from dataclasses import replace
+from collections import deque
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -33,9 +34,12 @@ MAX_AHEAD_US = 1_000_000  # of a camera's clock ahead of ours is a jump, not a s
 MAX_CHUNKS = 16  # that wait to be cut
 POLL_S = 0.002  # between two looks at the clock while nothing comes
 PATIENCE_S = 0.003  # by which events may come later than those before them
-MAX_DELAY_S = BUFFER_US * 1e-6  # of events that come in packets, for which windows wait
-DELAY_HALVES_S = 1.0  # in which a delay that does not recur is half forgotten
-BEHIND_S = 0.2  # for which all events come after their windows are over, before time restarts
+LEAST_PACKETS_HZ = 5  # of a live stream of which no event is to be lost
+MAX_DELAY_S = 1.25 / LEAST_PACKETS_HZ  # of events that come in packets, for which windows wait
+DELAY_KEPT_S = 5.0  # after which a delay that does not recur is forgotten
+BEHIND_S = 0.2  # for which a stream that is late loses events, before time restarts
+BEHIND_SHARE = 0.1  # of its events that are lost in that time, at least
+LEAST_LATE_S = MAX_DELAY_S / 4  # by which all of them are late: where restarting helps
 AGAIN = "again"  # in place of a chunk: the recording starts again
 STALL_S = 1.0  # without events, a live stream is said to have stalled
 
@@ -89,22 +93,42 @@ class CameraClock:
     """The wall time of a camera's clock, after the events that came soonest.
 
     What travels and is buffered comes late by changing spans; the least of them is taken for none.
-    `delay_s`: by how much later, of late, the first events of a chunk came.
     """
 
     def __init__(self):
         self.offset_s = math.nan  # wall minus recorded
-        self.observed_s = self.delay_s = 0.0
+        self.observed_s = 0.0
+        self.first_offsets: deque[tuple[float, float]] = deque()  # wall s, falling offset in s
 
     def observe(self, recorded_us: float, wall_s: float, first_us: float | None = None) -> None:
         """Events up to `recorded_us`, from `first_us` on, came at `wall_s`."""
         offset_s = wall_s - recorded_us * 1e-6
         if not math.isnan(self.offset_s):
             offset_s = min(offset_s, self.offset_s + MAX_DRIFT * (wall_s - self.observed_s))
-        self.delay_s *= 0.5 ** ((wall_s - self.observed_s) / DELAY_HALVES_S)
         self.offset_s, self.observed_s = offset_s, wall_s
         if first_us is not None:
-            self.delay_s = max(self.delay_s, min(wall_s - self.wall_s(first_us), MAX_DELAY_S))
+            self._keep_largest(wall_s, wall_s - first_us * 1e-6)
+
+    def _keep_largest(self, wall_s: float, offset_s: float) -> None:
+        """Take the offset of the first event of a chunk; forget what is smaller or too long ago."""
+        offsets = self.first_offsets
+        while offsets and offsets[-1][1] <= offset_s:
+            offsets.pop()
+        offsets.append((wall_s, offset_s))
+        while offsets[0][0] < wall_s - DELAY_KEPT_S:
+            offsets.popleft()
+
+    @property
+    def delay_s(self) -> float:
+        """Return by how much later, in the last DELAY_KEPT_S, the first events of a chunk came, in
+        0..MAX_DELAY_S."""
+        if not self.first_offsets:
+            return 0.0
+        return min(max(self.first_offsets[0][1] - self.offset_s, 0.0), MAX_DELAY_S)
+
+    def late_s(self, recorded_us: float, wall_s: float) -> float:
+        """Return how late an event of `recorded_us` came at `wall_s`; nan before the first."""
+        return wall_s - self.wall_s(recorded_us)
 
     def wall_s(self, recorded_us: float) -> float:
         """Return the wall time of `recorded_us`; nan before the first event."""
@@ -133,6 +157,22 @@ class OffClockEvents:
         return start
 
 
+@dataclass
+class RecentLoss:
+    """Live events since `start_s`: how many, how many of them were lost, and by how much all were
+    late."""
+
+    start_s: float
+    dropped_before: int  # since the cutter's clock began
+    events: int = 0
+    least_late_s: float = math.inf
+
+    def is_behind(self, dropped: int) -> bool:
+        """Return whether the stream is late as a whole and loses events."""
+        lost = dropped - self.dropped_before
+        return self.least_late_s > LEAST_LATE_S and lost > BEHIND_SHARE * self.events
+
+
 class FeedReader:
     """Fills `waiting` with windows of `feed`, and `counter` with their events, until stopped.
 
@@ -157,7 +197,8 @@ class FeedReader:
         self.chunks: queue.Queue = queue.Queue(MAX_CHUNKS)
         self.camera_clock = CameraClock()
         self.arrival_s: float | None = None  # wall time of the newest live events on the clock
-        self.behind_since_s: float | None = None  # wall time; None: not all events come too late
+        self.loss: RecentLoss | None = None
+        self.rare_s = -math.inf  # wall time of the last packet that began too long before it came
         self.off_clock = OffClockEvents()
         self.scene_events = 0  # on the clock, since the scene began
         self.state = "waiting"
@@ -259,24 +300,43 @@ class FeedReader:
                 self._hand_on(window, self.camera_clock.wall_s(window.end_us), stopped)
 
     def _add_live(self, events: np.ndarray, arrival_s: float) -> None:
-        """Take a live chunk; after a silence, a jump of the camera's clock, or where all events
-        come after their windows are over, time restarts."""
+        """Take a live chunk; after a silence, a jump of the camera's clock, or where the stream
+        stays late and loses events, time restarts."""
         events = self.cutter.drop_events_off_sensor(events)
+        silent_s = 0.0 if self.arrival_s is None else arrival_s - self.arrival_s
         if events.size and self.arrival_s is not None:
-            events = self._take_on_clock(events, arrival_s, arrival_s - self.arrival_s)
+            events = self._take_on_clock(events, arrival_s, silent_s)
         if not events.size:
             return
         self.faults.clear("stall")
         self.arrival_s = arrival_s
-        self.scene_events += len(events)
-        if self.cutter.add(events):
-            self.camera_clock = CameraClock()
-        if self._is_long_behind(arrival_s):
+        if self._is_long_behind(events["t"], arrival_s):
             text = f"events came too late for {BEHIND_S:g} s: started anew"
             self.faults.report("time", text)
             self._restart(new_scene=True)
-        elif self.cutter.origin_us is not None:
-            self.camera_clock.observe(self.cutter.last_us, arrival_s, float(events["t"][0]))
+        self.scene_events += len(events)
+        before_us = self.cutter.last_us
+        if self.cutter.add(events):
+            self.camera_clock, before_us = CameraClock(), -math.inf
+        first_us = self._find_first_us(events["t"], before_us, arrival_s)
+        if silent_s > MAX_DELAY_S < self.camera_clock.late_s(first_us, arrival_s):
+            self._report_rare_packets(silent_s, arrival_s)
+        if self.cutter.origin_us is not None:
+            self.camera_clock.observe(self.cutter.last_us, arrival_s, first_us)
+
+    def _find_first_us(self, times_us: np.ndarray, before_us: float, arrival_s: float) -> float:
+        """Return the earliest time, of those up to `before_us`, which are out of order, none more
+        than BUFFER_US before `arrival_s`."""
+        least_us = self.camera_clock.recorded_us(arrival_s) - BUFFER_US
+        late = np.maximum(times_us, least_us)
+        return float(np.where(times_us > before_us, times_us, late).min())
+
+    def _report_rare_packets(self, silent_s: float, arrival_s: float) -> None:
+        """Say that packets come too seldom, where the last one that did came just before."""
+        if arrival_s - self.rare_s <= STALL_S:
+            advice = f"send at {LEAST_PACKETS_HZ} Hz or more"
+            self.faults.report("rare", f"packets come every {silent_s * 1e3:.0f} ms: {advice}")
+        self.rare_s = arrival_s
 
     def _take_on_clock(self, events: np.ndarray, arrival_s: float, silent_s: float) -> np.ndarray:
         """Return the events on the camera's clock, which goes on after a silence.
@@ -312,18 +372,23 @@ class FeedReader:
         self._restart(new_scene=is_back)
         return events
 
-    def _is_long_behind(self, arrival_s: float) -> bool:
-        """Return whether no event since BEHIND_S came before its window was over."""
-        if not self.cutter.is_behind:
-            self.behind_since_s = None
-        elif self.behind_since_s is None:
-            self.behind_since_s = arrival_s
-        return self.behind_since_s is not None and arrival_s - self.behind_since_s > BEHIND_S
+    def _is_long_behind(self, times_us: np.ndarray, arrival_s: float) -> bool:
+        """Return whether BEHIND_S are over, in which the stream was late and lost events; events
+        of `times_us` come now."""
+        is_behind, dropped = False, self.cutter.dropped
+        if self.loss is None or arrival_s - self.loss.start_s > BEHIND_S:
+            is_at_limit = self.camera_clock.delay_s >= MAX_DELAY_S  # below, windows wait longer
+            is_behind = is_at_limit and self.loss is not None and self.loss.is_behind(dropped)
+            self.loss = RecentLoss(arrival_s, dropped)
+        late_s = self.camera_clock.late_s(float(times_us.max()), arrival_s)
+        self.loss.events += len(times_us)
+        self.loss.least_late_s = min(self.loss.least_late_s, late_s)
+        return is_behind
 
     def _restart(self, *, new_scene: bool = False) -> None:
         self.cutter.restart(new_scene=new_scene)
         self.scene_events = 0 if new_scene else self.scene_events
-        self.camera_clock, self.behind_since_s = CameraClock(), None
+        self.camera_clock, self.loss = CameraClock(), None
 
     def _hand_on(self, window: EventWindow, due_s: float, stopped: threading.Event) -> None:
         self.counter.add(window.events)

@@ -63,9 +63,9 @@ class WindowCutter:
         return float(self.order.last_us)
 
     @property
-    def is_behind(self) -> bool:
-        """Return whether the newest event's window is over, by the clock."""
-        return self.origin_us is not None and self.last_us < self._end_us(self.windows_cut)
+    def dropped(self) -> int:
+        """Return how many events were dropped for their times since the clock began."""
+        return self.order.dropped
 
     def restart(self, *, new_scene: bool = True) -> None:
         """Forget the clock: the next event starts a window, of a new scene or not."""
@@ -84,20 +84,21 @@ class WindowCutter:
         jump back in time."""
         events = self.drop_events_off_sensor(events)
         order = self.order
-        part, last_us = order.parts[-1], order.last_us
+        part = order.parts[-1]
         order.add(events)
         self._report_disorder()
         if order.parts[-1] is not part:
-            self.report_jump_back(last_us - order.parts[-1].first_us)
+            self.report_jump_back(part.last_us - order.parts[-1].first_us)
             self._forget_windows(True)
-        if self.origin_us is not None or not order.parts[-1].count:
-            return False
-        self.origin_us = float(order.parts[-1].first_us)
-        return True
+        is_new = self.origin_us is None and order.first_held_us is not None
+        if not self.windows_cut and order.first_held_us is not None:
+            self.origin_us = float(order.first_held_us)
+        return is_new
 
     def report_jump_back(self, back_us: float) -> None:
-        """Say that time jumped back."""
-        self.faults.report("time", f"time jumped back by {back_us * 1e-6:.3g} s: started anew")
+        """Say that time jumped back, if it did."""
+        if back_us > 0:
+            self.faults.report("time", f"time jumped back by {back_us * 1e-6:.3g} s: started anew")
 
     def report_dropped(self, count: int) -> None:
         """Say that so many events were dropped, if any."""

@@ -131,6 +131,7 @@ class Player:
             "state": "paused" if paused and reader.state != "broken" else reader.state,
             "paused": paused,
             "faults": self.faults.current(),
+            "counts": self.faults.counts(),
             "tone": self.tone.tone,
             "asked_fps": round(asked_fps, 1) if math.isfinite(asked_fps) else None,
             **rates,

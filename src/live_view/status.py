@@ -7,22 +7,34 @@ from collections import deque
 import numpy as np
 
 SHOWN_S = 3.0  # after it was last reported, a fault is taken for over
+COUNTS = {  # in the status, of the kinds of faults that concern some events or packets
+    "late": "events_dropped",
+    "order": "events_sorted",
+    "size": "events_off_sensor",
+    "lost": "events_not_cut",
+    "invalid": "events_invalid",
+    "packet": "packets_invalid",
+    "kernel": "packets_lost",
+}
 STAGES = ("decode", "cut", "events", "network", "page")
 
 
 class FaultLog:
-    """One line for each kind of fault, with how many events it concerned so far."""
+    """One line for each kind of fault, with how many events or packets it concerned so far."""
 
     def __init__(self) -> None:
         self.lock = threading.Lock()
-        self.lines: dict[str, tuple[float, str, int]] = {}
+        self.lines: dict[str, tuple[float, str]] = {}
+        self.totals = dict.fromkeys(COUNTS, 0)
 
     def report(self, kind: str, text: str, count: int = 0, *, until_cleared: bool = False) -> None:
-        """Show `text` for SHOWN_S or until `clear`; `count` adds to earlier ones of its kind."""
+        """Show `text` for SHOWN_S or until `clear`; `count` adds to the total of its kind, which is
+        one of COUNTS."""
         end = float("inf") if until_cleared else time.perf_counter() + SHOWN_S
         with self.lock:
-            _, _, before = self.lines.get(kind, (0.0, "", 0))
-            self.lines[kind] = (end, text, before + count)
+            self.lines[kind] = (end, text)
+            if count:
+                self.totals[kind] += count
 
     def clear(self, kind: str) -> None:
         """Remove the line of a kind."""
@@ -34,8 +46,16 @@ class FaultLog:
         with self.lock:
             now = time.perf_counter()
             self.lines = {kind: line for kind, line in self.lines.items() if line[0] > now}
-            lines = list(self.lines.values())
-        return [f"{text} ({count:,} events)" if count else text for _, text, count in lines]
+            return [text + self._describe_total(kind) for kind, (_, text) in self.lines.items()]
+
+    def _describe_total(self, kind: str) -> str:
+        total = self.totals.get(kind)
+        return f" ({total:,} {COUNTS[kind].partition('_')[0]})" if total else ""
+
+    def counts(self) -> dict[str, int]:
+        """Return what was concerned since the start, by the names of COUNTS."""
+        with self.lock:
+            return {name: self.totals[kind] for kind, name in COUNTS.items()}
 
 
 class PipelineCounters:

@@ -75,6 +75,11 @@ class EventSorter:
         """Return the latest time that is no outlier."""
         return self.parts[-1].last_us
 
+    @property
+    def first_held_us(self) -> int | None:
+        """Return the earliest time of what is in order and not given yet; None where nothing is."""
+        return int(event_times(self._held[0])[0]) if self._held else None
+
     def add(self, events: np.ndarray) -> list[np.ndarray]:
         """Take events; return those that are in order for good."""
         start = 2 * self.min_part_events
