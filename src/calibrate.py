@@ -3,6 +3,7 @@
 Each task writes its file, its table and its picture into the folder of the run.
 """
 
+import copy
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -34,7 +35,9 @@ from src.recordings.turbulence_measurement.gaussian_dots import GaussianFits
 from src.recordings.views import Views, load_views
 from src.records import results
 from src.records.atomic import check_writable, write_text
+from src.sim.pipeline import Pipeline
 
+MOST_NOISE = 0.2  # of a recording's events, by noise, without a warning
 MOST_LEFT_OUT = 0.05  # of a view, by another aspect, that is not worth a word
 Films = Float[np.ndarray, "views frames h w"]
 
@@ -117,27 +120,48 @@ def _find_views_in_scene(
     return views, found.summary()
 
 
-def find_contrast_threshold(cfg: DictConfig, run: Path) -> dict[str, tuple]:
+def find_contrast_threshold(cfg: DictConfig, run: Path) -> dict[str, tuple | float]:
     """Match the recording's event rate with that of the configured simulation; write
     `threshold.csv` and `threshold.png`."""
     if cfg.clips < 1:
         raise ValueError(f"clips must be >= 1, got {cfg.clips}")
-    options, pipeline = ReadOptions.from_keys(cfg), simulation.build_pipeline(cfg, "test")
+    if type(cfg.warmup_windows) is not int or cfg.warmup_windows < 0:
+        wanted = "a whole number >= 0"
+        raise ValueError(f"warmup_windows must be {wanted}, got {cfg.warmup_windows}")
+    options, pipeline = ReadOptions.from_keys(cfg), _build_warmed_up_pipeline(cfg)
     views = recording_inputs.find_views(cfg.recording, cfg.views, cfg.sensor_size, options)
     lookup = sensor_lookup.build_lookup(views)
     events = open_recording(cfg.recording, views.sensor, options)
     measured = contrast_threshold.measure_event_rates(events, lookup.view)
     contrast_threshold.require_both_polarities(measured)
     drawn = [pipeline.draw(index) for index in range(cfg.clips)]
-    clips = [pipeline.render_views([one])[0] for one in track(drawn, "simulated clips")]
+    clips = [pipeline.render_views([one])[0].half() for one in track(drawn, "simulated clips")]
     estimate = contrast_threshold.estimate_contrast_threshold(
-        measured, clips, cfg.fps * cfg.data.substeps, pipeline.sensor, progress=track
-    )
+        measured, clips, cfg.fps * cfg.data.substeps, pipeline.sensor, progress=track,
+        warmup=cfg.warmup_windows * cfg.data.substeps,
+    )  # fmt: skip
     if cfg.clips == 1:
         warnings.warn("clips=1: the interval holds no difference of scenes", stacklevel=2)
+    if estimate.noise_share > MOST_NOISE:
+        warnings.warn(
+            f"{estimate.noise_share:.0%} of the recording's events are what the simulated sensor"
+            " makes without change of light: C follows from sensor.dark_noise_hz and"
+            " sensor.leak_event_hz, which must be the camera's", stacklevel=2,
+        )  # fmt: skip
     contrast_threshold.write_threshold_csv(estimate, measured, run / "threshold.csv")
     calibration_figures.draw_event_rates(estimate, run / "threshold.png")
-    return {"ON (value, low, high)": estimate.on, "OFF": estimate.off}
+    return {
+        "ON (value, low, high)": estimate.on,
+        "OFF": estimate.off,
+        "noise, share of the events": estimate.noise_share,
+    }
+
+
+def _build_warmed_up_pipeline(cfg: DictConfig) -> Pipeline:
+    """Return the simulation of test clips with `cfg.warmup_windows` more windows."""
+    longer = copy.deepcopy(cfg)
+    longer.data.test_windows += cfg.warmup_windows
+    return simulation.build_pipeline(longer, "test")
 
 
 def measure_dot_statistics(cfg: DictConfig, run: Path) -> dot_statistics.DotStatistics:

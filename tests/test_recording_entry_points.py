@@ -20,6 +20,7 @@ from src.live import build_server
 from src.models.files import load
 from src.reconstruct import describe_run, reconstruct, show_progress, suggest_faster_form
 from src.recordings import reconstruction, sensor_lookup, simulated_recording, truth_file, views
+from src.recordings.calibration import contrast_threshold
 from src.recordings.files import read_events
 from src.sim.optics import layout
 from src.sim.sensor.sensor import EventSensor
@@ -407,12 +408,46 @@ def test_another_task_is_refused(tmp_path):
         calibrate(config("calibrate", tmp_path / "run", "task=guess", "recording=a.raw"))
 
 
+@pytest.mark.parametrize("wrong", [-1, 2.5])
+def test_windows_before_those_compared_are_a_whole_number(wrong, tmp_path):
+    chosen = ["task=threshold", "recording=a.raw", f"warmup_windows={wrong}"]
+    with pytest.raises(ValueError, match=f"warmup_windows must be a whole number .*, got {wrong}"):
+        calibrate(config("calibrate", tmp_path / "run", *chosen))
+
+
+def test_a_recording_of_noise_is_told_of_and_clips_are_longer_by_the_warmup(
+    folder, found, tmp_path, monkeypatch
+):
+    given, rates = [], np.array([1.0, 1.0])
+    curve = contrast_threshold.RateCurve(np.array([0.1, 1.0]), np.ones((2, 2, 2)), 1.0)
+    estimate = contrast_threshold.ThresholdEstimate(
+        (0.3, 0.2, 0.4), (0.3, 0.2, 0.4), curve, rates, np.ones((2, 2)), noise=rates / 4
+    )
+
+    def estimate_later(measured, clips, fps, sensor, *, progress, warmup):
+        given.append(([clip.shape[1] for clip in clips], warmup))
+        return estimate
+
+    monkeypatch.setattr(contrast_threshold, "estimate_contrast_threshold", estimate_later)
+    cfg = config(
+        "calibrate", tmp_path / "run", "task=threshold", f"recording={folder}/dot.raw",
+        f"views={found}", "scene.height=32", "scene.width=32", "turbulence=none", "clips=2",
+        "optics=single", "data.test_windows=2", "data.substeps=2", "warmup_windows=3",
+    )  # fmt: skip
+    with pytest.warns(UserWarning, match="25% of the recording's events .* without change of li"):
+        summary = calibrate(cfg)
+    assert given == [([11, 11], 6)]
+    assert summary["noise, share of the events"] == 0.25
+    assert "noise_hz,,0.25,0.25" in (tmp_path / "run" / "threshold.csv").read_text()
+
+
 def test_threshold_of_a_recording_of_the_simulated_clip_is_found_high_by_stray_light(tmp_path):
     cfg = config(
         "calibrate", tmp_path / "run", "task=threshold", f"recording={tmp_path}/cap.npz",
         f"views={tmp_path}/cap.views.yaml", "scene.height=64", "scene.width=64",
         "scene.speed_widths_per_s=[1.0,1.5]", "data.test_windows=12", "turbulence=none",
-        "sensor=ideal", "sensor.initial_reference_error=0", "clips=1", "fps=120",
+        "sensor=ideal", "sensor.initial_reference_error=0", "warmup_windows=0", "clips=1",
+        "fps=120",
     )  # fmt: skip
     pipeline = simulation.build_pipeline(cfg, "test")
     clip, fps = pipeline.render_views([pipeline.draw(0)])[0], cfg.fps * cfg.data.substeps

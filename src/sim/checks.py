@@ -8,10 +8,14 @@ from typing import Any
 import numpy as np
 
 
+def is_real(value: Any) -> bool:
+    """Return whether `value` is a real number of Python or NumPy, no bool."""
+    return isinstance(value, Real) and not isinstance(value, bool)
+
+
 def check_in_range(key: str, value: Any, low: float, high: float) -> None:
     """Raise ValueError for a value of `key` that is no number in [low, high]."""
-    is_number = isinstance(value, Real)
-    if not (is_number and low <= value <= high):
+    if not (is_real(value) and low <= value <= high):
         bounds = f">= {low:.5g}" if high == math.inf else f"in [{low:.5g}, {high:.5g}]"
         raise ValueError(f"{key} must be {bounds}, got {value}")
 
@@ -19,4 +23,4 @@ def check_in_range(key: str, value: Any, low: float, high: float) -> None:
 def is_range(ends: Any) -> bool:
     """Return whether `ends` are two numbers [low, high], a sequence or an array."""
     is_pair = isinstance(ends, Sequence | np.ndarray) and len(ends) == 2
-    return is_pair and all(isinstance(end, Real) for end in ends) and bool(ends[0] <= ends[1])
+    return is_pair and all(map(is_real, ends)) and bool(ends[0] <= ends[1])

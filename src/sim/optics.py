@@ -80,14 +80,19 @@ def check_positions(positions: Any, views: int | None = None) -> None:
 
 def _is_pair(value: Any, *kinds: type) -> bool:
     has_two = hasattr(value, "__len__") and len(value) == 2
-    return has_two and all(isinstance(axis, kinds) for axis in value)
+    return has_two and all(isinstance(v, kinds) and not isinstance(v, bool) for v in value)
+
+
+def check_reach(position: Position) -> None:
+    """Raise ValueError for a grid position beyond REACH."""
+    if max(map(abs, position)) > REACH:
+        raise ValueError(f"optics.positions must lie in -{REACH}..{REACH}, got {position}")
 
 
 def view_id(position: Position) -> int:
     """Return the number that keys the random draws of the view at `position` (centre: 144)."""
+    check_reach(position)
     row, col = position
-    if max(abs(row), abs(col)) > REACH:
-        raise ValueError(f"optics.positions must lie in -{REACH}..{REACH}, got {position}")
     return (row + REACH) * (2 * REACH + 1) + col + REACH
 
 
@@ -107,6 +112,8 @@ class Optics:
         if len(positions) != self.views or len(set(positions)) != self.views:
             allowed = f"{self.views} different (row, col)"
             raise ValueError(f"optics.positions must be {allowed}, got {positions}")
+        for position in positions:
+            check_reach(position)
         object.__setattr__(self, "positions", positions)
 
     @property

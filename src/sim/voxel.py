@@ -28,6 +28,8 @@ def voxel_grid(
     """Return the grid, float32, of the events with t0 <= t <= t1; zeros without any.  Warns where
     events are given and none lies in the window, or the type of `t` hardly resolves it.
 
+    Windows that follow each other share an edge: cut a list into t0 <= t < t1 first, as
+    `EventSensor.voxels` does, or an event on the edge counts in both.
     `t`, in the unit of `t0` and `t1` and in any order; `x`, `y` in pixels; `p` in {-1, 1} or
     {0, 1}, in each call by itself: without any -1 in it 0 is OFF, beside -1 it is refused.  All are
     arrays or tensors of one length.  Each event's weights are multiples of 2**-20, so that sums of

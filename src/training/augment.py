@@ -27,7 +27,7 @@ class Augment:
     `max_offset_pixel_fraction`: the share of pixels of a sequence with a constant offset is uniform
     up to this; each offset is normal and the same in all bins, views and windows.
     `max_firing_pixel_fraction`: the share of each view's pixels that fire without a change of light
-    is uniform up to this; ON and OFF alike, as a camera's hot pixels do.
+    is uniform up to this; ON and OFF alike, whole numbers in each bin, see add_firing_pixels.
     `pause_probability_when_running`, `.._when_paused`: that the next window has no events.
     `flip_probability`: for each axis.  The views of a grid change places with their images.
     `view_shift_probability`: of a view to be shifted by up to `max_view_shift_px` whole pixels in

@@ -59,7 +59,9 @@ def add_firing_pixels(
 
     `voxels`: (n, windows, views, bins, h, w).  Each has as many events a window as a Poisson
     process with a mean log-uniform in the clip's `events_per_window_ranges` = (low, high), each ON
-    or OFF.
+    or OFF.  Each bin counts whole events of its own, all bins alike.  In the bilinear grid of a hot
+    pixel events are shared by two bins; of five the first and last have 5/12 of the variance found
+    here, the others 5/6.
     """
     places, events = [], []
     for clip, (counts, key) in enumerate(zip(events_per_window_ranges, keys, strict=True)):

@@ -44,8 +44,9 @@ def test_a_layout_is_of_a_whole_number(views):
         ([(0, 0), (0, "1")], r"be a list of \(row, col\)"),
         ([(0, 0), (0, float("inf"))], r"be a list of \(row, col\)"),
         ([(0, 0), (0, 1, 2)], r"be a list of \(row, col\)"),
+        ([(0, 0), (False, True)], r"be a list of \(row, col\)"),
     ],
 )
 def test_wrong_positions(positions, message):
     with pytest.raises(ValueError, match=f"optics.positions must {message}"):
-        _ = Optics(2, positions).random_key_ids
+        Optics(2, positions)

@@ -126,6 +126,15 @@ def test_counts_are_those_of_the_list():
     assert counts.tolist() == [[[(p == 1).sum(), (p == -1).sum()]]]
 
 
+def test_counts_from_an_interval_on_are_those_of_the_rest_of_the_list():
+    frames = torch.rand(7, 16, 20, generator=torch.Generator().manual_seed(0)) * 0.9 + 0.05
+    sensor = EventSensor(0.3, refractory="hold", dark_noise_hz=50.0, cutoff_hz=50.0)
+    events = sensor.events(frames, 120.0)
+    p = events["p"][events["t"] >= 25000]
+    counts = sensor.counts(frames[None, None], 120.0, first_interval=3)
+    assert counts.tolist() == [[[(p == 1).sum(), (p == -1).sum()]]]
+
+
 def test_normalising_is_e2vids_formula():
     t, x, y, p = random_events(40)
     grid = voxel_grid(t, x, y, p, t0=0, t1=10000, **SIZE)

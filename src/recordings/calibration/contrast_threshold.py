@@ -2,13 +2,15 @@
 
 The simulator's rate over a grid of thresholds is inverted at the recording's rate.  This supposes
 that simulated and real scene agree in texture, speed and turbulence: a rate that is wrong by 10 %
-moves C by 4 to 10 %, and code values taken for light move it nearly threefold.  Rates are events
-per pixel of the sensor, not of the warped view, per second, ON and OFF apart.
+moves C by 4 to 10 %, and code values taken for light move it nearly threefold.  Noise counts too:
+that of the simulated sensor must be the camera's.  Rates are events per pixel of the sensor, not of
+the warped view, per second, ON and OFF apart.
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -150,21 +152,29 @@ class RateCurve:
 class ThresholdEstimate:
     """`on` and `off` thresholds: (value, low, high), the last two a 95 % bootstrap CI over time and
     scenes; the measured `rates` (ON, OFF) with their `interval` over time (low and high, ON and
-    OFF)."""
+    OFF); `noise`: those of the simulated sensor (ON, OFF) while the light rests."""
 
     on: tuple[float, float, float]
     off: tuple[float, float, float]
     curve: RateCurve
     rates: Float[np.ndarray, " 2"]
     interval: Float[np.ndarray, "2 2"]
+    noise: Float[np.ndarray, " 2"]
+
+    @property
+    def noise_share(self) -> float:
+        """The share of the recording's events that the sensor makes without change of light."""
+        return float(self.noise.sum() / self.rates.sum())
 
 
 def simulate_event_rates(
     clips: Iterable[Clip], fps: float, sensor: Sensor, thresholds: Sequence[float] = GRID, *,
-    off_ratio: float = 1.0,
+    off_ratio: float = 1.0, warmup: int = 0,
 ) -> RateCurve:  # fmt: skip
     """Return the rates of a sensor that sees `clips`, at all thresholds with the same noise.
 
+    Events of the first `warmup` frame intervals do not count: they take the references from where
+    they are drawn to where a running camera has them.
     Its own `threshold` and `off_ratio` are not used, and none of its pixels is hot: those of a
     recording are left out.  Raises ValueError for another sensor.
     """
@@ -176,8 +186,10 @@ def simulate_event_rates(
     rates = []
     for index, frames in enumerate(clips):
         views, count, h, w = frames.shape
-        counts = [one.counts(frames[None], fps, clips=[index])[0] for one in sensors]
-        exposure = views * h * w * (count - 1) / fps
+        counts = [
+            one.counts(frames[None], fps, [index], first_interval=warmup)[0] for one in sensors
+        ]
+        exposure = views * h * w * (count - 1 - warmup) / fps
         rates.append((torch.stack(counts).sum(1).double() / exposure).numpy())
     return RateCurve(grid.double().numpy(), np.stack(rates), off_ratio)
 
@@ -185,18 +197,20 @@ def simulate_event_rates(
 def estimate_contrast_threshold(
     rates: EventRates, clips: Sequence[Clip], fps: float, sensor: Sensor,
     thresholds: Sequence[float] = GRID,
-    progress: Progress[Clip] = no_progress,
+    progress: Progress[Clip] = no_progress, *, warmup: int = 0,
 ) -> ThresholdEstimate:  # fmt: skip
     """Return the thresholds at which the sensor makes the recording's rates.
 
     The geometric mean of ON and OFF rate gives their size; the quotient gives the ratio of OFF to
     ON, as what rises has to fall.  Intervals end where the grid does.  `progress(clips, name)`
-    yields the clips of each of the ROUNDS, as rich.progress.track does.  Raises ValueError for a
-    rate that the grid does not make, and for a quotient of rates that no ratio in OFF_RATIOS makes.
+    yields the clips of each of the ROUNDS, as rich.progress.track does.  `warmup`: as in
+    `simulate_event_rates`.  Raises ValueError for a rate that the grid does not make, and for a
+    quotient of rates that no ratio in OFF_RATIOS makes.
     """
     require_both_polarities(rates)
     measured, drawn = rates.pooled, np.maximum(rates.bootstrap_pooled_rates(), 1e-12)
-    best, other = _find_off_ratio(measured, clips, fps, sensor, thresholds, progress)
+    simulate = partial(simulate_event_rates, fps=fps, sensor=sensor, warmup=warmup)
+    best, other = _find_off_ratio(measured, clips, simulate, thresholds, progress)
     moved = other.log_ratio - best.log_ratio
     gain = float(np.clip((other.excess - best.excess) / moved, *GAINS))
     on_gain = np.log(other.on / best.on) / moved
@@ -211,9 +225,10 @@ def estimate_contrast_threshold(
     drawn_on = np.clip(ons[1:], thresholds[0], thresholds[-1])
     drawn_off = drawn_on * np.clip(ratios[1:], *OFF_RATIOS)
     on_off = (_bound(on, drawn_on, thresholds), _bound(off, drawn_off, thresholds))
-    return ThresholdEstimate(
-        *on_off, best.curve, measured, np.percentile(drawn, (2.5, 97.5), axis=0)
-    )
+    still = [clip[:, -1:].expand_as(clip) for clip in clips]
+    noise = simulate(still, thresholds=[best.on], off_ratio=best.curve.off_ratio).rates[0]
+    interval = np.percentile(drawn, (2.5, 97.5), axis=0)
+    return ThresholdEstimate(*on_off, best.curve, measured, interval, noise)
 
 
 def _bound(
@@ -241,7 +256,7 @@ class _Round:
 
 
 def _find_off_ratio(
-    measured: np.ndarray, clips: Sequence[Clip], fps: float, sensor: Sensor,
+    measured: np.ndarray, clips: Sequence[Clip], simulate: Callable[..., RateCurve],
     thresholds: Sequence[float], progress: Progress[Clip],
 ) -> tuple[_Round, _Round]:  # fmt: skip
     """Return the round whose OFF ratio makes the quotient of the rates, by the secant method, and
@@ -250,7 +265,7 @@ def _find_off_ratio(
     for number in range(1, ROUNDS + 1):
         followed = progress(clips, f"event rates, round {number} of {ROUNDS} at most")
         ratio = float(np.clip(np.exp(log_ratio), *OFF_RATIOS))
-        curve = simulate_event_rates(followed, fps, sensor, thresholds, off_ratio=ratio)
+        curve = simulate(followed, thresholds=thresholds, off_ratio=ratio)
         on = float(find_on_threshold(curve, measured))
         if not np.isfinite(on) and rounds:  # the step was too long
             log_ratio = (log_ratio + rounds[-1].log_ratio) / 2
@@ -311,6 +326,7 @@ def write_threshold_csv(estimate: ThresholdEstimate, rates: EventRates, path: Pa
     """Write the curve, the rates of each view and the estimate as one table."""
     curve = zip(estimate.curve.thresholds, estimate.curve.rates, strict=True)
     rows = [("simulated_hz", f"{threshold:.4g}", *pair) for threshold, pair in curve]
+    rows += [("noise_hz", "", *estimate.noise)]
     rows += [("measured_hz", index, *pair) for index, pair in enumerate(rates.per_view)]
     bounds = zip(("estimate", "low", "high"), estimate.on, estimate.off, strict=True)
     rows += [(name, "", on, off) for name, on, off in bounds]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from src.sim import noise
-from src.sim.checks import check_in_range, is_range
+from src.sim.checks import check_in_range, is_range, is_real
 from src.sim.sensor.engines import records
 from src.sim.sensor.engines.records import CLIP, EngineInput
 from src.sim.sensor.response import UNIT, low_pass_table, response_table
@@ -146,11 +146,10 @@ def _noise_keys(clips: Sequence[SensorClip], views: Sequence[int]) -> NDArray[np
 
 def threshold_range(threshold: Any) -> tuple[float, float]:
     """Return (low, high) of `sensor.threshold`, a number or a range."""
-    is_number = isinstance(threshold, int | float)
-    if not (is_number or is_range(threshold)):
+    if not (is_real(threshold) or is_range(threshold)):
         allowed = "a number or [low, high], low <= high"
         raise ValueError(f"sensor.threshold must be {allowed}, got {threshold}")
-    ends = [threshold, threshold] if is_number else threshold
+    ends = [threshold, threshold] if is_real(threshold) else threshold
     for end in ends:
         check_in_range("sensor.threshold", end, *RANDOM_RANGES["threshold"])
     return float(ends[0]), float(ends[1])

@@ -76,7 +76,8 @@ class EventSensor:
     reference moves on; ESIM), `hold` (the pixel starts from the level at the end; hardware).
     `stamps`: `linear`, the crossing's own time, or `v2e`, spread evenly by the pixel of the view
     with most crossings.  `input`: the frames are taken for intensity (`linear`) or decoded here
-    (`srgb`).  `response`: `log` of max(intensity, floor), or `linlog`, v2e's.
+    (`srgb`), but for `dark_noise_hz`, which follows the code value; pipelines give decoded frames.
+    `response`: `log` of max(intensity, floor), or `linlog`, v2e's.
     `mismatch`: relative deviation of a pixel's thresholds, fixed per (seed, view, pixel).
     `leak_event_hz`: ON events of a pixel whose light does not change; references then begin up to
     one ON threshold below the first level, so that they come from the start.  `dark_noise_hz`:
@@ -141,10 +142,15 @@ class EventSensor:
         return run.voxels(given, grids).transpose(1, 2)
 
     def counts(
-        self, frames: ViewFrames, fps: float, clips: Sequence[int] | None = None
-    ) -> Int[Tensor, "n views 2"]:
-        """Return the numbers of ON and OFF events of each clip and view; `clips` as in `voxels`."""
-        return sensor_cpu.counts(self._engine_input(frames.cpu(), fps, clips))
+        self, frames: ViewFrames, fps: float, clips: Sequence[int] | None = None, *,
+        first_interval: int = 0,
+    ) -> Int[Tensor, "n views 2"]:  # fmt: skip
+        """Return the numbers of ON and OFF events of each clip and view; `clips` as in `voxels`.
+
+        Events between frames before number `first_interval` are simulated and not counted.
+        """
+        given = self._engine_input(frames.cpu(), fps, clips)
+        return sensor_cpu.counts(given._replace(first_interval=first_interval))
 
     def events(
         self, frames: Float[Tensor, "frames h w"], fps: float, *, clip: int = 0, view: int = 0,

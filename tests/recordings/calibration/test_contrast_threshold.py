@@ -1,6 +1,7 @@
 """Event rates and the threshold found by them, on recordings whose threshold is known."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -56,6 +57,49 @@ def test_a_known_threshold_is_found(on, off_ratio, refractory_s):
     assert abs(np.log(found.off[0] / (on * off_ratio))) < 0.12
     assert found.on[1] < found.on[0] < found.on[2]
     assert found.off[1] < found.off[0] < found.off[2]
+
+
+def trembling(seed: int, frames: int, side: int = 24) -> torch.Tensor:
+    """One view whose light trembles about its mean, 1/e after 0.1 s: (1, frames, side, side)."""
+    g = torch.Generator().manual_seed(seed)
+    drawn, kept = 0.2 * torch.randn(frames, side, side, generator=g), np.exp(-10 / FPS)
+    for before, now in pairwise(drawn):
+        now.mul_(np.sqrt(1 - kept**2)).add_(before, alpha=kept)
+    return torch.exp(drawn - 1.5).clamp(max=1)[None]
+
+
+def trembling_recording(camera: EventSensor) -> contrast_threshold.EventRates:
+    """Eight recordings of a third of a second each by a camera that has run for two seconds."""
+    clips = [trembling(seed, 281) for seed in range(8)]
+    counts = [camera.counts(c[None], FPS, [k], first_interval=240)[0] for k, c in enumerate(clips)]
+    return contrast_threshold.EventRates(
+        torch.stack(counts).numpy(), np.array([24**2]), np.array([0]), 40 / FPS
+    )
+
+
+def test_the_threshold_of_a_camera_that_has_run_is_found_in_a_scene_at_rest():
+    """Each reference settles once, by an event, wherever it begins."""
+    camera = EventSensor(0.4, refractory_s=0.0, dark_noise_hz=0.2)
+    measured = trembling_recording(camera)
+    clips = [trembling(seed, 121) for seed in range(100, 104)]
+    unknown = replace(camera, initial_reference_error=1.0)
+    found = contrast_threshold.estimate_contrast_threshold(measured, clips, FPS, unknown, warmup=80)
+    assert found.on[1] < 0.4 < found.on[2]
+    assert abs(np.log(found.on[0] / 0.4)) < 0.1
+    late = [clip[:, 80:] for clip in clips]
+    cold = contrast_threshold.estimate_contrast_threshold(measured, late, FPS, unknown)
+    assert cold.on[1] > 0.4 and cold.on[0] > 1.1 * 0.4
+
+
+def test_the_share_of_noise_is_that_of_the_sensor_without_change_of_light():
+    camera = EventSensor(0.8, refractory_s=0.0, dark_noise_hz=1.0)
+    measured = trembling_recording(camera)
+    found = contrast_threshold.estimate_contrast_threshold(
+        measured, [trembling(100, 121)], FPS, camera, warmup=80
+    )
+    noise_hz = 1 - 0.75 * np.exp(-1.5 + 0.2**2 / 2)
+    assert found.noise.sum() == pytest.approx(noise_hz, rel=0.1)
+    assert found.noise_share == pytest.approx(noise_hz / measured.pooled.sum(), rel=0.1)
 
 
 def test_the_same_scene_gives_the_threshold_exactly():

@@ -329,6 +329,8 @@ def test_levels_are_the_logarithm_to_one_unit():
         ({"random_share": -0.1}, r"sensor.random_share must be in \[0, 1\], got -0.1"),
         ({"random_share": 1.1}, r"sensor.random_share must be in \[0, 1\], got 1.1"),
         ({"random_share": math.nan}, r"sensor.random_share must be in \[0, 1\], got nan"),
+        ({"refractory_s": True}, r"sensor.refractory_s must be in \[0, 10\], got True"),
+        ({"random": {"refractory_s": [False, True]}}, "sensor.random.refractory_s must be"),
     ],
 )
 def test_settings_outside_their_range_are_named(settings_, words):
@@ -336,7 +338,7 @@ def test_settings_outside_their_range_are_named(settings_, words):
         EventSensor(**settings_)
 
 
-@pytest.mark.parametrize("threshold", [["a", "b"], [[0.1, 0.2], 0.3], [0.1], [], "a", None])
+@pytest.mark.parametrize("threshold", [["a", "b"], [[0.1, 0.2], 0.3], [0.1], [], "a", None, True])
 def test_a_threshold_that_is_no_number_and_no_range_is_named(threshold):
     with pytest.raises(ValueError, match=r"^sensor.threshold must be a number or \[low, high\], l"):
         threshold_range(threshold)

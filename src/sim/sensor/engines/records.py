@@ -38,7 +38,8 @@ class EngineInput(NamedTuple):
     of response.py; `low_pass_tables` (rows, 2, nodes), decay and lag at the same nodes, no row
     without a low-pass; these are tensors, for the CPU's kernels arrays, their frames' pixels in one
     axis.  `edges_us` (n, frames): each clip's clock at the frames; `clips` (n,) of CLIP; `keys`
-    (n, views, KEYS): those of mismatch, hot pixels, noise events and references, 0 where not drawn.
+    (n, views, KEYS): those of mismatch, hot pixels, noise events and references, 0 where not drawn;
+    `first_interval`: the first between frames whose events are put out, by the CPU's kernels.
     """
 
     frames: Any
@@ -51,6 +52,7 @@ class EngineInput(NamedTuple):
     v2e_stamps: bool
     clips: np.ndarray
     keys: NDArray[np.int64]
+    first_interval: int = 0
 
 
 def check_intensities(frames: Tensor) -> None:

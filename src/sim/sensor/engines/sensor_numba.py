@@ -455,7 +455,8 @@ def advance_interval(given, clip, hot_count, work, output, place, intensity, key
         draw_noise_events(work, key, frame, last)
     while done < last:
         number, done = advance_active_pixels(given, f32(clip.refractory), work, steps, done, last)
-        add_events_to_output(output, place, given.width, work, number, clock)
+        if frame >= given.first_interval:
+            add_events_to_output(output, place, given.width, work, number, clock)
     if clip.leak:
         for x in range(level.size):
             reference[x] -= drift[x]
