@@ -10,13 +10,16 @@ import time
 import warnings
 
 import faery
+import numba
 import numpy as np
 import pytest
 import torch
 from aiohttp import ClientSession, WSMsgType
+from numba.core.dispatcher import Dispatcher
 
 from baselines.highpass import HighPass
 from src import live
+from src.deploy.engines import tiles_numba
 from src.live_view import event_feeds, frame_buffer
 from src.live_view.feed_reader import BEHIND_S, STALL_S, FeedReader, PlaybackClock
 from src.live_view.frame_buffer import PolarityAccumulator
@@ -30,7 +33,7 @@ from src.live_view.network_runner import NetworkRunner, RunSettings
 from src.live_view.page_server import PageServer
 from src.live_view.status import FaultLog, PipelineCounters
 from src.models.setnet import SetNet
-from src.recordings import event_windows, noise_filter, reconstruction
+from src.recordings import event_windows, noise_filter, reconstruction, sensor_lookup
 from src.recordings.files import event_order
 from src.recordings.files.event_file import EVENT
 from src.recordings.files.event_writers import write_events
@@ -543,6 +546,52 @@ def test_kernels_are_loaded_before_the_first_events(recording, monkeypatch):
     assert reader.cutter.origin_us is None and reader.cutter.starts_scene
     assert not reader.faults.current() and not reader.counter.windows
     reader.feed.close()
+
+
+@pytest.fixture
+def kernel_types(monkeypatch):
+    """The types of what kernels are called with, each of which numba compiles for."""
+    found = set()
+    for module in (tiles_numba, sensor_lookup, frame_buffer, noise_filter):
+        for name, kernel in vars(module).copy().items():
+            if isinstance(kernel, Dispatcher):
+
+                def spy(*given, kernel=kernel, name=name):
+                    found.add((name, *map(str, map(numba.typeof, given))))
+                    return kernel(*given)
+
+                monkeypatch.setattr(module, name, spy)
+    return found
+
+
+def local_and_other_windows() -> list[np.ndarray]:
+    """Return windows of no event, one, few, in one place again and again, and everywhere."""
+    rng, (height, width) = np.random.default_rng(0), scenes.SENSOR
+    windows = [np.zeros(count, EVENT) for count in (0, 1, 60, *[500] * 25, 20_000, 1, 0)]
+    for events in windows:
+        side = 20 if 1 < len(events) < 1000 else height
+        events["x"] = (width - side) // 2 + rng.integers(0, side, len(events))
+        events["y"] = (height - side) // 2 + rng.integers(0, side, len(events))
+        events["p"] = rng.choice([-1, 1], len(events))
+    return windows
+
+
+def test_a_runner_has_compiled_all_kernels_when_it_is_made(kernel_types):
+    net, settings = SetNet.preset("small").eval(), RunSettings(600.0, form="float32")
+    runner = NetworkRunner("net", net, scenes.views(), settings)
+    counter, keep = PolarityAccumulator(runner.lookup), noise_filter.NoiseFilter(scenes.SENSOR, 1.0)
+    counter.is_watched = True
+
+    def run(events: np.ndarray, *, restart: bool) -> None:
+        counter.add(keep(events))
+        runner.begin(EventWindow(0.0, 1e6 / 600, events), restart=restart)()
+
+    run(np.zeros(50, EVENT), restart=True)
+    before = kernel_types.copy()
+    for events in local_and_other_windows():
+        run(events, restart=False)
+    assert {"scatter", "gather_interpolated"} <= {name for name, *_ in before}
+    assert kernel_types == before
 
 
 def test_loads_are_cpu_time_not_waits(recording):
