@@ -140,7 +140,7 @@ def _list_trial_events(lookup: SensorLookup) -> list[np.ndarray]:
 
 class Controls:
     """What a visitor can choose: one of `networks`, on how many of `views`; `offered`: the numbers
-    of views for each; `chosen`: what runs now, on `runner`."""
+    of views for each; `chosen`: what runs now, on `runner`; `preparing`: what is made ready."""
 
     def __init__(
         self, networks: Mapping[str, EventToVideoNetwork], views: Views, settings: RunSettings
@@ -151,6 +151,7 @@ class Controls:
             for name, network in networks.items()
         }
         self.chosen: dict[str, int | str] = {}
+        self.preparing: dict[str, int | str] | None = None
         self.runner: NetworkRunner | None = None
         self.one_view_runner: NetworkRunner | None = None  # beside `runner`, to compare
         self.compares_one_view = False
@@ -186,12 +187,16 @@ class Controls:
 
     def _make_runner(self, network: str, count: int) -> NetworkRunner:
         with self.lock:
-            if (network, count) not in self.runners:
+            if (network, count) in self.runners:
+                return self.runners[network, count]
+            self.preparing = {"network": network, "views": count}
+            try:
                 used = self.views.select(positions_used(count, self.views.positions))
-                self.runners[network, count] = NetworkRunner(
-                    network, self.networks[network], used, self.settings
-                )
-            return self.runners[network, count]
+                runner = NetworkRunner(network, self.networks[network], used, self.settings)
+            finally:
+                self.preparing = None
+            self.runners[network, count] = runner
+            return runner
 
 
 def offered_view_counts(network_views: int | None, positions: Sequence[Position]) -> list[int]:

@@ -8,6 +8,7 @@ import socket
 import threading
 import time
 import warnings
+from contextlib import asynccontextmanager
 
 import faery
 import numba
@@ -20,7 +21,7 @@ from numba.core.dispatcher import Dispatcher
 from baselines.highpass import HighPass
 from src import live
 from src.deploy.engines import tiles_numba
-from src.live_view import event_feeds, frame_buffer
+from src.live_view import event_feeds, frame_buffer, network_runner
 from src.live_view.feed_reader import BEHIND_S, STALL_S, FeedReader, PlaybackClock
 from src.live_view.frame_buffer import PolarityAccumulator
 from src.live_view.live_windows import (
@@ -654,8 +655,9 @@ NONSENSE = (
 
 
 async def _header(socket) -> dict:
-    """Return the header of the next message, which is whole."""
+    """Return the header of the next message, which is whole; say that it came."""
     message = await socket.receive(timeout=20)
+    await socket.send_str("received")
     assert message.type == WSMsgType.BINARY
     length = int.from_bytes(message.data[:4], "little")
     header = json.loads(message.data[4 : 4 + length])
@@ -687,6 +689,121 @@ def test_the_server_answers_and_takes_only_what_makes_sense(recording):
     refused = [answer["refused"] for answer in answers if "refused" in answer]
     assert any("views_used must be one of" in line for line in refused)
     assert not any(one["faults"] for one in headers)  # which all visitors see
+
+
+@asynccontextmanager
+async def visiting(made: PageServer):
+    """Serve, without playing; yield a visitor's socket."""
+    stop = asyncio.Event()
+    running = asyncio.create_task(made.run(lambda: None, stop))
+    await asyncio.sleep(0.2)
+    base = f"http://127.0.0.1:{made.port}"
+    async with ClientSession(base) as session, session.ws_connect("/stream") as socket:
+        yield socket
+    stop.set()
+    await running
+
+
+async def until_true(condition) -> None:
+    """Wait until `condition`, at most 20 s."""
+    end = time.monotonic() + 20
+    while not condition():
+        assert time.monotonic() < end
+        await asyncio.sleep(0.02)
+
+
+def test_a_visitor_who_takes_little_sees_the_newest_in_the_third_message(page_server):
+    page = page_server.page
+
+    async def visit() -> list[dict]:
+        async with visiting(page_server) as socket:
+            for _ in range(40):
+                show_frame(page)
+                await asyncio.sleep(1 / 30)
+            await socket.send_str('{"pause": true}')
+            await asyncio.sleep(1.0)
+            return [await _header(socket) for _ in range(3)]
+
+    headers = asyncio.run(visit())
+    assert [name for name, _ in headers[2]["pictures"]] == ["frame", "events", "slice"]
+    assert headers[2]["status"]["paused"] and headers[2]["status"]["slice_s"] > 1.0
+
+
+def test_who_answers_more_than_was_sent_gets_no_more_at_a_time(page_server):
+    async def visit() -> list[dict]:
+        async with visiting(page_server) as socket:
+            for _ in range(10):
+                await socket.send_str("received")
+            await asyncio.sleep(1.5)  # in which there are five readings of the meters
+            page_server.page.handle_request({"pause": True})
+            await asyncio.sleep(0.5)
+            return [await _header(socket) for _ in range(5)]
+
+    headers = asyncio.run(visit())
+    assert not any("refused" in header for header in headers)
+    assert headers[4]["status"]["paused"]
+
+
+def test_a_pause_does_not_wait_for_a_network_that_is_made_ready(page_server, monkeypatch):
+    page, is_ready = page_server.page, threading.Event()
+
+    def prepare(*given):
+        assert is_ready.wait(20)
+        return NetworkRunner(*given)
+
+    monkeypatch.setattr(network_runner, "NetworkRunner", prepare)
+
+    async def visit() -> None:
+        async with visiting(page_server) as socket:
+            for asked in ({"network": "net", "views": 1}, {"pause": True}, {"all_views": True}):
+                await socket.send_str(json.dumps(asked))
+            await until_true(lambda: page.all_views and page.status()["paused"])
+            await until_true(lambda: page.status()["preparing"] == {"network": "net", "views": 1})
+            assert page.status()["chosen"]["views"] == 9
+            is_ready.set()
+            await until_true(lambda: page.status()["chosen"]["views"] == 1)
+            assert page.status()["preparing"] is None
+
+    asyncio.run(visit())
+
+
+@pytest.mark.parametrize("asked", ["no json", "[1]", "[" * 4000])
+def test_a_request_that_is_no_json_object_is_told_what_one_is(page_server, asked):
+    async def visit() -> str:
+        async with visiting(page_server) as socket:
+            await socket.send_str(asked)
+            while "refused" not in (header := await _header(socket)):
+                pass
+            return header["refused"]
+
+    shown = asked if len(asked) < 40 else "[" * 40 + "..."
+    wanted = 'a request must be a JSON object such as {"pause": true}'
+    assert asyncio.run(visit()) == f"{wanted}, got {shown}"
+
+
+def test_the_hint_goes_when_no_window_is_dropped_any_more(page_server):
+    player, shown = page_server.page.player, np.zeros((88, 88), np.float32)
+    player.reader.state, player.meters.span_s = "playing", 0.5
+
+    def show_window() -> None:
+        count = player.frames.count
+        player.begun.put((EventWindow(0.0, 1.0, np.zeros(1, EVENT)), lambda: shown, None))
+        until(lambda: player.frames.count > count and not player.begun.qsize())
+
+    thread = threading.Thread(target=player.run_network, args=(player.stopped,))
+    thread.start()
+    player.reader.waiting.dropped = 7
+    for _ in range(5):
+        show_window()
+    until(lambda: player.status()["hint"] is not None)
+    time.sleep(0.6)
+    for _ in range(5):
+        show_window()
+    until(lambda: player.status()["fps"] > 0)
+    status = player.status()
+    player.stopped.set()
+    thread.join()
+    assert status["hint"] is None and status["dropped"] == 7
 
 
 def pictures(message: bytes | None) -> list[str]:
@@ -790,6 +907,17 @@ def test_a_page_s_port_in_use_is_refused(recording):
         taken.listen()
         with pytest.raises(ValueError, match=f"port={made.port} cannot be used"):
             asyncio.run(live.play_and_serve(made))
+
+
+def test_a_port_in_use_is_refused_before_networks_are_loaded(tmp_path, monkeypatch):
+    monkeypatch.setattr(live, "build_server", lambda cfg: pytest.fail("networks are loaded"))
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        cfg = config("live", tmp_path / "run", "recording=cap.raw", f"port={port}")
+        with pytest.raises(ValueError, match=f"host=127.0.0.1 port={port} cannot be used"):
+            live.live(cfg)
 
 
 def test_port_0_is_a_free_one_that_is_named(recording):
