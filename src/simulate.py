@@ -122,13 +122,12 @@ def simulate_scene(cfg: DictConfig) -> dict:
     tilt, drawn = pipeline.tilt(draw), sample.parameters[0]
     results.create_run_folder(run, entry_point.resolved_yaml(cfg))
     counts = sample.voxels[0].sum(2).transpose(0, 1).numpy()
-    views_shown, tilt_shown = (part[:, step::step].numpy() for part in (views, tilt))
-    shown = (part[:, :DRAWN_FRAMES] for part in (views_shown, tilt_shown, counts))
+    seen, pushed = (part[:, step::step][:, :DRAWN_FRAMES].numpy() for part in (views, tilt))
     clean = crop_frames(draw.clip.frames, draw.crop)[::step]
     print(describe_clip(cfg, drawn, clean.shape, draw.clip.fps / step))
     how = pipeline.optics, step / draw.clip.fps
-    first = clean[1 : DRAWN_FRAMES + 1].numpy()
-    written = samples.write_light_field_panels(run, first, *shown, *how)
+    first, counts = clean[1 : DRAWN_FRAMES + 1].numpy(), counts[:, :DRAWN_FRAMES]
+    written = samples.write_light_field_panels(run, first, seen, pushed, counts, *how)
     if camera is None:
         print(f"written: {', '.join(map(str, written))}")
         return drawn
