@@ -19,6 +19,7 @@ async def look(port: int) -> None:
     ):
         second, messages, size = time.monotonic(), 0, 0
         async for message in socket:
+            await socket.send_str("received")
             messages, size = messages + 1, size + len(message.data)
             if time.monotonic() - second >= 1:
                 print(messages, size, flush=True)

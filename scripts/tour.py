@@ -21,6 +21,7 @@ from src.sim.pipeline import ClipParameters, Pipeline
 
 OUT = HOME / "docs" / "figures" / "tour"
 SIDE, WINDOWS, PITCH = 192, 40, 24  # pixels of a frame; length of the clip; pixels between stars
+STARS_PX, GAMMA = 72, 1.5  # of the part of a frame with stars that is shown
 
 
 def grey_to_rgb(grey: np.ndarray) -> np.ndarray:
@@ -48,12 +49,12 @@ def outline(picture: np.ndarray) -> np.ndarray:
 
 def stars(pipeline: Pipeline, draw: ClipParameters) -> np.ndarray:
     """Return what two neighbouring views make of a grid of points: the PSF of each place, moved by
-    the tilt there."""
+    the tilt there; with GAMMA, white from half of the largest value on."""
     points = torch.zeros_like(draw.clip.frames[:1])
     points[:, PITCH // 2 :: PITCH, PITCH // 2 :: PITCH] = 1
     air, drawer = pipeline.turbulence_operator(draw), pipeline.turbulence_generator(draw)
     seen = air.degrade(points[None], drawer)[0, :2, 0].numpy()
-    return np.clip(2 * seen / seen.max(), 0, 1)
+    return np.clip(2 * seen / seen.max(), 0, 1) ** (1 / GAMMA)
 
 
 def chip(pipeline: Pipeline, draw: ClipParameters, views: torch.Tensor) -> np.ndarray:
@@ -87,8 +88,8 @@ def draw_all(index: int) -> None:
     save("1_scene", {"first frame": grey_to_rgb(truth[0]), "last frame": grey_to_rgb(truth[-1])})
     right, down = render_events(tilt[centre].numpy(), full=reach)
     save("2_tilt", {f"tilt in x, to {reach:.1f} px": right, "tilt in y": down})
-    first, second = map(grey_to_rgb, stars(pipeline, draw)[:, :96, :96])
-    save("3_psfs", {"points through one view": first, "through its neighbour": second}, scale=4)
+    first, second = map(grey_to_rgb, stars(pipeline, draw)[:, :STARS_PX, :STARS_PX])
+    save("3_psfs", {"points through one view": first, "through its neighbour": second}, scale=6)
     grid = place_views_at_apertures(
         [grey_to_rgb(view[-1:].numpy()) for view in views], pipeline.optics
     )[0]

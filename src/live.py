@@ -23,7 +23,13 @@ from src.live_view.feed_reader import FeedReader, PlaybackClock
 from src.live_view.frame_buffer import FrameRing, PolarityAccumulator
 from src.live_view.live_windows import WindowCutter, WindowQueue
 from src.live_view.network_runner import Controls, RunSettings
-from src.live_view.page_server import THIS_MACHINE, LivePage, PageServer, find_page_address
+from src.live_view.page_server import (
+    THIS_MACHINE,
+    LivePage,
+    PageServer,
+    check_address,
+    find_page_address,
+)
 from src.live_view.player import Player
 from src.live_view.status import FaultLog, PipelineCounters
 from src.models.network import EventToVideoNetwork
@@ -43,6 +49,7 @@ def live(cfg: DictConfig) -> None:
     Raises ValueError for a recording, views, network or address that cannot be used.
     """
     check_thread_count(cfg.threads)
+    asyncio.run(check_address(cfg.host, cfg.port))  # before networks are loaded
     torch.set_num_threads(cfg.threads)
     asyncio.run(play_and_serve(build_server(cfg)))
 

@@ -62,7 +62,7 @@ def reconstruct(cfg: DictConfig) -> Path:
             last_s, count = time.perf_counter() - start, count + 1
             first_s = first_s or last_s
     said = describe_run(video, size, len(views.views), count, first_s, last_s)
-    print(said + suggest_faster_form(cfg, network, last_s))
+    print(said + describe_playback(cfg) + suggest_faster_form(cfg, network, last_s))
     return run
 
 
@@ -112,6 +112,17 @@ def describe_run(
         f"of which {first_s:.1f} s prepare the network and give the first frame{speed}; "
         f"times in {video.parent / 'frames.csv'}"
     )
+
+
+def describe_playback(cfg: DictConfig) -> str:
+    """Return at what share of real time a film is shown, to add to the line of a run; "" of frames
+    that have no rate."""
+    if cfg.output_format not in ("mp4", "gif", "film"):
+        return ""
+    slower = cfg.fps / cfg.playback_fps
+    times = f"{max(slower, 1 / slower):.3g} times {'slower' if slower > 1 else 'faster'}"
+    speed = "in real time" if slower == 1 else f"{times} than real time"
+    return f"; shown at playback_fps={cfg.playback_fps:g}, {speed}"
 
 
 def suggest_faster_form(cfg: DictConfig, network: EventToVideoNetwork, run_s: float) -> str:

@@ -33,12 +33,12 @@ from src.sim.sensor.response import encode_srgb
 SECTIONS = ("scene", "optics", "turbulence", "sensor", "data")
 CLIP_KEYS = (*SECTIONS, "seed", "fps", "bins")  # what makes a clip
 SCENE_FPS = 120.0  # of a clip of a scene, unless fps says another
-DRAWN_FRAMES = 24  # of the user's clip in views.gif
+DRAWN_FRAMES = 24  # in views.gif
 
 
 def simulate(cfg: DictConfig) -> dict:
     """Simulate `video` or `photo`, or clip `index` of `split` of a scene; draw clean, views, tilt
-    and events as `views.gif`, `.png`.
+    and events of the first DRAWN_FRAMES frames as `views.gif`, of the last of these as `.png`.
 
     With `like`, the config of another run, it is just the clip that run saw (not augmented), with
     `large` one of its `data.large`.
@@ -122,11 +122,12 @@ def simulate_scene(cfg: DictConfig) -> dict:
     tilt, drawn = pipeline.tilt(draw), sample.parameters[0]
     results.create_run_folder(run, entry_point.resolved_yaml(cfg))
     counts = sample.voxels[0].sum(2).transpose(0, 1).numpy()
-    seen = views[:, step::step].numpy(), tilt[:, step::step].numpy(), counts
+    seen, pushed = (part[:, step::step][:, :DRAWN_FRAMES].numpy() for part in (views, tilt))
     clean = crop_frames(draw.clip.frames, draw.crop)[::step]
     print(describe_clip(cfg, drawn, clean.shape, draw.clip.fps / step))
     how = pipeline.optics, step / draw.clip.fps
-    written = samples.write_light_field_panels(run, clean[1:].numpy(), *seen, *how)
+    first, counts = clean[1 : DRAWN_FRAMES + 1].numpy(), counts[:, :DRAWN_FRAMES]
+    written = samples.write_light_field_panels(run, first, seen, pushed, counts, *how)
     if camera is None:
         print(f"written: {', '.join(map(str, written))}")
         return drawn

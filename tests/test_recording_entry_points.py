@@ -18,7 +18,13 @@ from src.compare import compare, default_video_names
 from src.figures import comparison
 from src.live import build_server
 from src.models.files import load
-from src.reconstruct import describe_run, reconstruct, show_progress, suggest_faster_form
+from src.reconstruct import (
+    describe_playback,
+    describe_run,
+    reconstruct,
+    show_progress,
+    suggest_faster_form,
+)
 from src.recordings import reconstruction, sensor_lookup, simulated_recording, truth_file, views
 from src.recordings.calibration import contrast_threshold
 from src.recordings.files import read_events
@@ -181,6 +187,7 @@ def test_a_film_shows_events_one_view_all_views_and_the_clean_clip(
     (line,) = [one for one in capsys.readouterr().out.splitlines() if "film.mp4" in one]
     assert line.startswith(f"{run}/film.mp4: 15 frames, 364x106 px, 9 views; ")
     assert re.search(r", after the first frame \d+\.\d frames per second of wall time, read", line)
+    assert "; shown at playback_fps=30, " in line
 
 
 def test_what_a_run_replaces_is_said_and_no_frame_of_it_stays(folder, tmp_path, capsys):
@@ -206,6 +213,20 @@ def test_the_line_of_a_run_counts_one_and_says_what_the_first_frame_took():
     line = describe_run(Path("run/video.mp4"), (64, 96), 9, 61, 2.0, 14.0)
     assert "61 frames, 96x64 px, 9 views; 14.0 s, of which 2.0 s prepare the network" in line
     assert "after the first frame 5.0 frames per second" in line
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (["output_format=gif"], "; shown at playback_fps=30, 4 times slower than real time"),
+        (["fps=15"], "; shown at playback_fps=30, 2 times faster than real time"),
+        (["output_format=film", "fps=30"], "; shown at playback_fps=30, in real time"),
+        (["output_format=hdf5"], ""),
+    ],
+)
+def test_the_line_of_a_run_says_how_fast_a_film_is_shown(given, said, tmp_path):
+    cfg = config("reconstruct", tmp_path, "recording=cap.raw", *given)
+    assert describe_playback(cfg) == said
 
 
 def test_a_faster_form_is_named_after_a_slow_run_that_it_can_run(tmp_path, monkeypatch):

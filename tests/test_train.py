@@ -11,6 +11,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from lightning.pytorch.callbacks import ModelCheckpoint
 from omegaconf import DictConfig
+from PIL import Image
 
 from src.app import entry_point
 from src.eval import evaluate
@@ -187,3 +188,11 @@ def test_simulate_draws_the_views_and_writes_a_recording(turbulence, tmp_path):
     assert (tmp_path / "views.png").is_file()
     assert len(read_events(tmp_path / "cap.raw")) > 100
     assert (tmp_path / "cap.views.yaml").is_file() and (tmp_path / "cap.truth.h5").is_file()
+
+
+def test_the_film_of_a_long_clip_of_nine_views_is_small(tmp_path):
+    cfg = config("simulate", tmp_path, "data.test_windows=30", "turbulence=strong")
+    simulate(cfg)
+    with Image.open(tmp_path / "views.gif") as film:
+        assert film.n_frames == 24 and film.size[0] <= 972
+    assert (tmp_path / "views.gif").stat().st_size < 5e6

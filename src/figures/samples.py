@@ -20,7 +20,7 @@ from src.sim.pipeline import Sample
 PLAYBACK_FPS = 15.0
 TITLE_PX = 18  # height of the strip with a panel's name
 GAP_PX = 4
-MAX_VIEW_PX = 160  # longest side of a view in views.gif
+MAX_VIEW_PX, MAX_VIEWS_PX = 160, 240  # longest side in views.gif of a view, of all side by side
 WEBP_QUALITY = 70
 MIN_HEIGHT_PX = 160  # lower panels are enlarged by a whole factor
 
@@ -62,13 +62,16 @@ def write_light_field_panels(
 ) -> list[Path]:  # fmt: skip
     """Write `views.gif` and its last frame `views.png`: the clean clip, and of every view its
     light, in [0, 1], its tilt and its sums of polarity over a window of `window_s` seconds, in the
-    arrangement of the views; pictures longer than MAX_VIEW_PX shrunk to that, sums to those of
-    largest magnitude.
+    arrangement of the views; pictures longer than MAX_VIEW_PX, or all together than MAX_VIEWS_PX,
+    shrunk to that, sums to those of largest magnitude.
 
     Of `tilt`, in pixels, that in x is drawn: red where the picture is pushed right, blue where
     left.  The clean clip is as high as all views together.
     """
-    views, tilt, counts = _shrink(views), _shrink(tilt), shrink_events(counts)
+    across = max(max(places) - min(places) + 1 for places in zip(*optics.positions, strict=True))
+    longest_px = min(MAX_VIEW_PX, MAX_VIEWS_PX // across)
+    views, tilt = (_shrink(pictures, longest_px) for pictures in (views, tilt))
+    counts = shrink_events(counts, longest_px)
     seen = place_views_at_apertures(list(views), optics)
     events = [render_events(part) for part in counts]
     reach = max(float(np.abs(tilt).max()), 1e-6)
@@ -86,22 +89,26 @@ def write_light_field_panels(
     return paths
 
 
-def _shrink(pictures: Float[np.ndarray, "*n h w"]) -> Float[np.ndarray, "*n h2 w2"]:
-    """Return pictures at most MAX_VIEW_PX long, by means over areas."""
+def _shrink(
+    pictures: Float[np.ndarray, "*n h w"], longest_px: int
+) -> Float[np.ndarray, "*n h2 w2"]:
+    """Return pictures at most `longest_px` long, by means over areas."""
     *shape, height, width = pictures.shape
-    shrink = MAX_VIEW_PX / max(height, width)
+    shrink = longest_px / max(height, width)
     if shrink >= 1:
         return pictures
     small = resize_pictures(pictures.reshape(-1, height, width), max(1, round(height * shrink)))
     return small.reshape(*shape, *small.shape[1:])
 
 
-def shrink_events(counts: Float[np.ndarray, "*n h w"]) -> Float[np.ndarray, "*n h2 w2"]:
-    """Return sums of polarity at most MAX_VIEW_PX long: of each area the one of largest magnitude,
+def shrink_events(
+    counts: Float[np.ndarray, "*n h w"], longest_px: int = MAX_VIEW_PX
+) -> Float[np.ndarray, "*n h2 w2"]:
+    """Return sums of polarity at most `longest_px` long: of each area the one of largest magnitude,
     as in a mean single events would fade."""
     most = least = counts
     height, width = counts.shape[-2:]
-    shrink = min(1.0, MAX_VIEW_PX / max(height, width))
+    shrink = min(1.0, longest_px / max(height, width))
     height_px = max(1, round(height * shrink))
     sizes = {-2: height_px, -1: max(1, round(width * height_px / height))}  # as resize_pictures
     for axis, small in sizes.items():

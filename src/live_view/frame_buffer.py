@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from src.recordings.engines.splat import count_polarity
+from src.recordings.files.event_arrays import contiguous_columns
 from src.recordings.sensor_lookup import SensorLookup
 from src.recordings.views import HeightWidth
 from src.sim.optics import Position
@@ -118,7 +119,7 @@ class PolarityAccumulator:
     def add(self, events: np.ndarray) -> None:
         """Add a window's events (t x y p) of the sensor."""
         if self.is_watched:
-            x, y, p = (events[name] for name in "xyp")
+            x, y, p = contiguous_columns(events, "xyp")
             with self.lock:
                 count_polarity(x, y, p, self.lookup.nearest_model_pixel, self.counts)
                 self.windows += 1

@@ -26,11 +26,12 @@ from src.recordings.reconstruction import (
     build_runnable_network,
     reconstruct_frames,
 )
-from src.recordings.sensor_lookup import build_lookup
+from src.recordings.sensor_lookup import SensorLookup, build_lookup
 from src.recordings.views import Views
 from src.sim.optics import Position, layout
 
 VIEW_COUNTS = (1, 3, 5, 9)  # to choose from, where the light field has them
+TRIAL_PX, TRIAL_PIXELS = 8, 16  # where a picture's first tile has its middle; some pixels there
 Finish = Callable[[], Float[np.ndarray, "h w"]]
 
 
@@ -71,10 +72,7 @@ class NetworkRunner:
         # One without overlapping windows can begin a window while another is finished.
         self.is_pipelined = is_runtime and self.frames_per_window == 1
         self.recent: deque[EventWindow] = deque(maxlen=self.frames_per_window)
-        events = np.zeros(1000, EVENT)  # to run on, so that nothing is compiled while windows wait
-        events["x"] = np.linspace(0, views.sensor[1] - 1, len(events))
-        events["y"], events["p"] = views.sensor[0] // 2, 1
-        for _ in range(3):
+        for events in _list_trial_events(self.lookup):
             self.begin(EventWindow(0.0, 1e6 / fps, events), restart=True)()
 
     def begin(self, window: EventWindow, *, restart: bool = False) -> Finish:
@@ -127,9 +125,22 @@ class NetworkRunner:
         return self.picture
 
 
+def _list_trial_events(lookup: SensorLookup) -> list[np.ndarray]:
+    """Return windows of events to run on, so that nothing is compiled while windows wait: in one
+    tile, for kernels on few tiles, and along a row, three times, for the network on whole maps."""
+    off_tile = np.abs(lookup.model_xy - TRIAL_PX).max(-1)
+    nearest = np.argsort(np.where(lookup.view == 0, off_tile, np.inf), axis=None)[:TRIAL_PIXELS]
+    height, width = lookup.view.shape
+    spot, row = np.zeros(10 * len(nearest), EVENT), np.zeros(1000, EVENT)
+    spot["y"], spot["x"] = np.unravel_index(np.tile(nearest, 10), (height, width))
+    row["x"], row["y"] = np.linspace(0, width - 1, len(row)), height // 2
+    spot["p"] = row["p"] = 1
+    return [spot, row, row, row]
+
+
 class Controls:
     """What a visitor can choose: one of `networks`, on how many of `views`; `offered`: the numbers
-    of views for each; `chosen`: what runs now, on `runner`."""
+    of views for each; `chosen`: what runs now, on `runner`; `preparing`: what is made ready."""
 
     def __init__(
         self, networks: Mapping[str, EventToVideoNetwork], views: Views, settings: RunSettings
@@ -140,6 +151,7 @@ class Controls:
             for name, network in networks.items()
         }
         self.chosen: dict[str, int | str] = {}
+        self.preparing: dict[str, int | str] | None = None
         self.runner: NetworkRunner | None = None
         self.one_view_runner: NetworkRunner | None = None  # beside `runner`, to compare
         self.compares_one_view = False
@@ -175,12 +187,16 @@ class Controls:
 
     def _make_runner(self, network: str, count: int) -> NetworkRunner:
         with self.lock:
-            if (network, count) not in self.runners:
+            if (network, count) in self.runners:
+                return self.runners[network, count]
+            self.preparing = {"network": network, "views": count}
+            try:
                 used = self.views.select(positions_used(count, self.views.positions))
-                self.runners[network, count] = NetworkRunner(
-                    network, self.networks[network], used, self.settings
-                )
-            return self.runners[network, count]
+                runner = NetworkRunner(network, self.networks[network], used, self.settings)
+            finally:
+                self.preparing = None
+            self.runners[network, count] = runner
+            return runner
 
 
 def offered_view_counts(network_views: int | None, positions: Sequence[Position]) -> list[int]:

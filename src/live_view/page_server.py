@@ -1,8 +1,9 @@
 """The web server: the page, its stream of messages, `/status` and `/frame.png`.
 
 A message of the stream is the length of a JSON header (uint32, little endian), the header, and the
-JPEGs it lists.  The browser sends JSON: pause, line, network and views, all_views, tone, one_view;
-what makes no sense is answered by a header with `refused`, a line.
+JPEGs it lists.  The browser answers each by the text `received`: no more than MOST_ON_THEIR_WAY are
+sent without that answer.  It asks in JSON: pause, line, network and views, all_views, tone,
+one_view; what makes no sense is answered by a header with `refused`, a line.
 """
 
 import asyncio
@@ -13,7 +14,7 @@ import re
 import socket
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import cv2
@@ -33,11 +34,15 @@ from src.sim.optics import Position
 HTML = Path(__file__).with_name("live.html")
 PICTURES_HZ = 30.0
 STATUS_S = 0.25  # between two readings of the meters on the page
+RECEIVED = "received"
+MOST_ON_THEIR_WAY = 2  # messages to a visitor; 30 a second also where an answer takes 60 ms
 MAX_REQUEST_BYTES = 4096
+SHOWN_REQUEST = 40  # characters of a request that is refused
 NO_CACHE = {"Cache-Control": "no-store"}
 ORIGIN = re.compile(r"(https?://[a-z0-9.-]+(:\d+)?)/?")
 THIS_MACHINE = ("127.0.0.1", "localhost", "::1")
 FLAGS = ("pause", "all_views", "one_view")
+SLOW_REQUESTS = ("network", "one_view")  # may have to make a network ready
 REQUESTS = (*FLAGS, "tone", "line", "network", "views")
 ALL_ADDRESSES = ("0.0.0.0", "::")
 
@@ -60,21 +65,20 @@ class LivePage:
 
         Where one picture cannot be drawn, it and those after it are left out: a fault.
         """
-        pictures = []
+        pictures = {}
         try:
-            for picture in self._draw_pictures(whole):
-                pictures.append(picture)
+            for name, picture in self._draw_pictures(whole):
+                pictures[name] = picture
         except Exception as error:  # one picture must not end the page
             fault = f"pictures cannot be drawn: {type(error).__name__}: {error}"
             self.player.faults.report("pictures", fault)
-        header: dict = {"pictures": [[name, len(data)] for name, data in pictures]}
-        now = time.perf_counter()
+        header, now = {}, time.perf_counter()
         if whole or now - self.status_sent >= STATUS_S:
             header["status"] = self.status()
             self.status_sent = self.status_sent if whole else now
         elif not pictures:
             return None
-        return _pack(header) + b"".join(data for _, data in pictures)
+        return _pack(header, pictures)
 
     def status(self) -> dict:
         """Return the meters, and what is chosen and offered."""
@@ -86,6 +90,7 @@ class LivePage:
             "one_view": self.controls.one_view_runner is not None,
             "offered": self.controls.offered,
             "chosen": self.controls.chosen,
+            "preparing": self.controls.preparing,
         }
 
     def _draw_pictures(self, whole: bool) -> Iterator[tuple[str, bytes]]:
@@ -111,18 +116,18 @@ class LivePage:
         """Do what a visitor asks; raises ValueError, and does nothing, where a part of it makes no
         sense."""
         self._check_request(request)
-        if "network" in request:
-            self.controls.choose(str(request["network"]), request.get("views", "all"))
         if "pause" in request:
             self.player.set_paused(request["pause"])
         if "tone" in request:
             self.player.set_tone(request["tone"])
-        if "one_view" in request:
-            self.controls.compare_one_view(request["one_view"])
         if "all_views" in request:
             self.all_views = request["all_views"]
         if "line" in request:
             self.slice.line = _parse_line(request["line"])
+        if "network" in request:
+            self.controls.choose(str(request["network"]), request.get("views", "all"))
+        if "one_view" in request:
+            self.controls.compare_one_view(request["one_view"])
 
     def _check_request(self, request: dict) -> None:
         if unknown := request.keys() - set(REQUESTS):
@@ -140,14 +145,34 @@ class LivePage:
             raise ValueError(f"views must come with network, got views={request['views']} alone")
 
 
-def _pack(header: dict) -> bytes:
-    text = json.dumps(header).encode()
-    return len(text).to_bytes(4, "little") + text
+def _pack(header: dict, pictures: dict[str, bytes]) -> bytes:
+    sizes = [[name, len(data)] for name, data in pictures.items()]
+    text = json.dumps(header | {"pictures": sizes}).encode()
+    return len(text).to_bytes(4, "little") + text + b"".join(pictures.values())
 
 
-def _picture_names(message: bytes) -> set[str]:
-    length = int.from_bytes(message[:4], "little")
-    return {name for name, _ in json.loads(message[4 : 4 + length])["pictures"]}
+def _unpack(message: bytes) -> tuple[dict, dict[str, bytes]]:
+    at = 4 + int.from_bytes(message[:4], "little")
+    header, pictures = json.loads(message[4:at]), {}
+    for name, size in header["pictures"]:
+        pictures[name] = message[at : at + size]
+        at += size
+    return header, pictures
+
+
+def _merge(older: bytes, newer: bytes) -> bytes:
+    """Return a message of all that is in one of two, of what is in both the newer."""
+    (header, pictures), (new_header, new_pictures) = map(_unpack, (older, newer))
+    return _pack(header | new_header, pictures | new_pictures)
+
+
+def _parse_request(text: str) -> dict:
+    """Return what a visitor asks; raises ValueError where it is no JSON object."""
+    with suppress(ValueError, RecursionError):
+        if isinstance(request := json.loads(text), dict):
+            return request
+    got = text if len(text) <= SHOWN_REQUEST else text[:SHOWN_REQUEST] + "..."
+    raise ValueError(f'a request must be a JSON object such as {{"pause": true}}, got {got}')
 
 
 def _parse_line(numbers: object) -> Line:
@@ -173,6 +198,8 @@ class PageServer:
         self.origins = {_parse_origin(origin) for origin in allowed_origins}
         self.proxies = {origin.partition("://")[2] for origin in self.origins}
         self.visitors: set[asyncio.Queue] = set()
+        self.answers: set[asyncio.Task] = set()  # being made
+        self.one_by_one = asyncio.Lock()  # SLOW_REQUESTS are done
         self.app = web.Application(
             middlewares=[self._own_pages_only], client_max_size=MAX_REQUEST_BYTES
         )
@@ -189,12 +216,9 @@ class PageServer:
         runner = web.AppRunner(self.app, access_log=None, shutdown_timeout=0.5)
         await runner.setup()
         try:
-            await web.TCPSite(runner, self.host, self.port).start()
-        except (OSError, OverflowError) as error:
-            await runner.cleanup()
-            raise ValueError(f"host={self.host} port={self.port} cannot be used: {error}") from None
-        self.port = runner.addresses[0][1]
-        try:
+            with _named_address(self.host, self.port):
+                await web.TCPSite(runner, self.host, self.port).start()
+            self.port = runner.addresses[0][1]
             on_ready()
             await self._tick(stop)
         finally:
@@ -220,16 +244,11 @@ class PageServer:
                 await asyncio.wait_for(stop.wait(), max(left, 0.001))
 
     def _hand_out(self, message: bytes) -> None:
-        """Put `message` into every queue; in place of one with pictures that it lacks, which a slow
-        visitor has not taken, put all there is."""
-        pictures, whole = _picture_names(message), None
+        """Put `message` into every queue; in place of one that a slow visitor has not taken, put
+        the newer of each part of both."""
         for queue in self.visitors:
             untaken = queue.get_nowait() if queue.full() else None
-            if untaken is not None and _picture_names(untaken) - pictures:
-                whole = whole or self.page.message(whole=True)
-                queue.put_nowait(whole)
-            else:
-                queue.put_nowait(message)
+            queue.put_nowait(message if untaken is None else _merge(untaken, message))
 
     @web.middleware
     async def _own_pages_only(self, request: web.Request, handler) -> web.StreamResponse:
@@ -275,31 +294,56 @@ class PageServer:
         )
         await visitor.prepare(request)
         queue: asyncio.Queue = asyncio.Queue(1)
+        room = asyncio.BoundedSemaphore(MOST_ON_THEIR_WAY)
         queue.put_nowait(self.page.message(whole=True))
         self.visitors.add(queue)
-        sending = asyncio.create_task(_send(visitor, queue))
+        sending = asyncio.create_task(_send(visitor, queue, room))
         try:
             async for message in visitor:
                 if message.type != WSMsgType.TEXT:
                     continue
-                if refused := await self._handle(message.data):
-                    await visitor.send_bytes(_pack({"pictures": [], "refused": refused}))
+                if message.data == RECEIVED:
+                    with suppress(ValueError):  # answers more than were sent
+                        room.release()
+                    continue
+                answer = asyncio.create_task(self._answer(visitor, message.data))
+                self.answers.add(answer)
+                answer.add_done_callback(self.answers.discard)
         finally:
             self.visitors.discard(queue)
             sending.cancel()
         return visitor
 
-    async def _handle(self, text: str) -> str:
-        """Do what a visitor asks, in a thread: a network may have to be made ready.  Return why it
-        is refused, else ""."""
+    async def _answer(self, visitor: web.WebSocketResponse, text: str) -> None:
+        """Do what a visitor asks, SLOW_REQUESTS in a thread, so that others do not wait; or send
+        why it is refused."""
         try:
-            request = json.loads(text)
-            if not isinstance(request, dict):
-                raise ValueError(f"a request must be a mapping, got {request}")
-            await asyncio.to_thread(self.page.handle_request, request)
-        except (ValueError, OverflowError, RecursionError) as error:
-            return str(error)
-        return ""
+            request = _parse_request(text)
+            if request.keys() & set(SLOW_REQUESTS):
+                async with self.one_by_one:
+                    await asyncio.to_thread(self.page.handle_request, request)
+            else:
+                self.page.handle_request(request)
+        except (ValueError, OverflowError) as error:
+            with suppress(ConnectionError, RuntimeError):  # the visitor has gone
+                await visitor.send_bytes(_pack({"refused": str(error)}, {}))
+
+
+async def check_address(host: str, port: int) -> None:
+    """Raise ValueError where a page cannot be served at `host`:`port`."""
+    with _named_address(host, port):
+        server = await asyncio.get_running_loop().create_server(asyncio.Protocol, host, port)
+    server.close()
+    await server.wait_closed()
+
+
+@contextmanager
+def _named_address(host: str, port: int) -> Iterator[None]:
+    """Raise ValueError in place of the errors of an address that cannot be used."""
+    try:
+        yield
+    except (OSError, OverflowError) as error:
+        raise ValueError(f"host={host} port={port} cannot be used: {error}") from None
 
 
 def find_page_address(host: str, port: int) -> str:
@@ -331,9 +375,12 @@ def _parse_origin(origin: str) -> str:
     return found[1]
 
 
-async def _send(visitor: web.WebSocketResponse, queue: asyncio.Queue) -> None:
-    """Send what is put into `queue`; None closes the stream."""
+async def _send(
+    visitor: web.WebSocketResponse, queue: asyncio.Queue, room: asyncio.BoundedSemaphore
+) -> None:
+    """Send what is put into `queue`, each when there is `room` for one more on its way: what waits
+    before a socket grows old.  None closes the stream."""
     with suppress(ConnectionError, RuntimeError):  # the visitor has gone
-        while (message := await queue.get()) is not None:
+        while await room.acquire() and (message := await queue.get()) is not None:
             await visitor.send_bytes(message)
         await visitor.close()

@@ -32,6 +32,10 @@ class Player:
         self.running_one_view: NetworkRunner | None = None
         self.one_view: np.ndarray | None = None  # newest frame of the network on one view
         self.shown_us: float | None = None  # recorded time of the newest frame
+        self.dropped, self.dropped_s = (
+            0,
+            -math.inf,
+        )  # windows, and the wall time of the last of them
         self.begun: queue.Queue[tuple[EventWindow, Finish, Finish | None]] = queue.Queue(1)
         self.stopped = threading.Event()
         self.threads = [
@@ -103,6 +107,11 @@ class Player:
             self.shown_us = window.end_us
             self.meters.add_busy_time("network", time.thread_time() - start)
             self.meters.add_frame(time.perf_counter() - window.due_s, len(window.events))
+            self._note_dropped()
+
+    def _note_dropped(self) -> None:
+        if self.dropped != self.reader.waiting.dropped:
+            self.dropped, self.dropped_s = self.reader.waiting.dropped, time.perf_counter()
 
     def set_paused(self, paused: bool) -> None:
         """Pause or play.  What a live stream sends during a pause is left out."""
@@ -110,14 +119,16 @@ class Player:
         (running.clear if paused else running.set)()
 
     def _suggest_fps(self, reached: float, asked: float) -> str | None:
-        """Return what to set where windows are dropped now, in frames per second of recorded time;
-        None where they are not.  `reached` and `asked` are per second of the clock on the wall.
+        """Return what to set where windows were dropped in the seconds that rates are taken over,
+        in frames per second of recorded time; None where none was.  `reached` and `asked` are per
+        second of the clock on the wall.
 
         What a window costs is that of the present ones: of longer ones, with more events, more.
         """
         suggested = math.floor(SPARED * reached / self.reader.clock.speed)
         is_short = self.reader.state == "playing" and reached < SPARED * asked < math.inf
-        if not (is_short and self.reader.waiting.dropped and suggested):
+        is_dropping = time.perf_counter() - self.dropped_s < self.meters.span_s
+        if not (is_short and is_dropping and suggested):
             return None
         return f"fps={suggested} or less (of recorded time) drops fewer; longer windows take longer"
 

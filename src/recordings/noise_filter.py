@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from src.recordings.engines.event_passes import LONG_AGO_US, mark_supported_events
+from src.recordings.files.event_arrays import contiguous_columns
 from src.recordings.views import HeightWidth
 
 LONGEST_S = 1e6
@@ -41,9 +42,8 @@ class NoiseFilter:
         Raises ValueError for an event off the sensor.
         """
         kept = np.empty(len(events), bool)
-        wrong = mark_supported_events(
-            events["t"], events["x"], events["y"], self.latest_us, self.support_us, kept
-        )
+        t, x, y = contiguous_columns(events, "txy")
+        wrong = mark_supported_events(t, x, y, self.latest_us, self.support_us, kept)
         if wrong >= 0:
             height, width = (side - 2 for side in self.latest_us.shape)
             place = f"x={events['x'][wrong]}, y={events['y'][wrong]}"

@@ -11,6 +11,7 @@ from src.recordings.engines.splat import (
     list_nearest_contributions,
     splat_and_count_outside,
 )
+from src.recordings.files.event_arrays import contiguous_columns
 from src.recordings.views import HeightWidth, Views
 
 MIN_DENSITY = 0.1  # where fewer sensor pixels than this map to a model pixel, no scaling up
@@ -39,7 +40,7 @@ class SensorLookup:
         the nearest pixel in space.  Raises ValueError for an event off the sensor.
         """
         self.check_on_sensor(events)
-        t, x, y, p = (events[name] for name in "txyp")
+        t, x, y, p = contiguous_columns(events, "txyp")
         edges = float(start_us), float(end_us)
         return splat_and_count_outside(t, x, y, p, self.view, self.model_xy, grid, *edges, nearest)
 
@@ -54,7 +55,7 @@ class SensorLookup:
         count = (1 if nearest else 4) * len(events)
         dtypes = (np.int64, np.int64, np.int64, np.int64, np.float32)
         index, u, v, which, weight = made = [np.empty(count, dtype) for dtype in dtypes]
-        x, y, p = (events[name] for name in "xyp")
+        x, y, p = contiguous_columns(events, "xyp")
         if nearest:
             geometry = self.nearest_model_pixel, density[:, 0]
             entries, outside = list_nearest_contributions(x, y, p, *geometry, *made)

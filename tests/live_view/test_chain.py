@@ -8,16 +8,20 @@ import socket
 import threading
 import time
 import warnings
+from contextlib import asynccontextmanager
 
 import faery
+import numba
 import numpy as np
 import pytest
 import torch
 from aiohttp import ClientSession, WSMsgType
+from numba.core.dispatcher import Dispatcher
 
 from baselines.highpass import HighPass
 from src import live
-from src.live_view import event_feeds, frame_buffer
+from src.deploy.engines import tiles_numba
+from src.live_view import event_feeds, frame_buffer, network_runner
 from src.live_view.feed_reader import BEHIND_S, STALL_S, FeedReader, PlaybackClock
 from src.live_view.frame_buffer import PolarityAccumulator
 from src.live_view.live_windows import (
@@ -30,7 +34,7 @@ from src.live_view.network_runner import NetworkRunner, RunSettings
 from src.live_view.page_server import PageServer
 from src.live_view.status import FaultLog, PipelineCounters
 from src.models.setnet import SetNet
-from src.recordings import event_windows, noise_filter, reconstruction
+from src.recordings import event_windows, noise_filter, reconstruction, sensor_lookup
 from src.recordings.files import event_order
 from src.recordings.files.event_file import EVENT
 from src.recordings.files.event_writers import write_events
@@ -545,6 +549,52 @@ def test_kernels_are_loaded_before_the_first_events(recording, monkeypatch):
     reader.feed.close()
 
 
+@pytest.fixture
+def kernel_types(monkeypatch):
+    """The types of what kernels are called with, each of which numba compiles for."""
+    found = set()
+    for module in (tiles_numba, sensor_lookup, frame_buffer, noise_filter):
+        for name, kernel in vars(module).copy().items():
+            if isinstance(kernel, Dispatcher):
+
+                def spy(*given, kernel=kernel, name=name):
+                    found.add((name, *map(str, map(numba.typeof, given))))
+                    return kernel(*given)
+
+                monkeypatch.setattr(module, name, spy)
+    return found
+
+
+def local_and_other_windows() -> list[np.ndarray]:
+    """Return windows of no event, one, few, in one place again and again, and everywhere."""
+    rng, (height, width) = np.random.default_rng(0), scenes.SENSOR
+    windows = [np.zeros(count, EVENT) for count in (0, 1, 60, *[500] * 25, 20_000, 1, 0)]
+    for events in windows:
+        side = 20 if 1 < len(events) < 1000 else height
+        events["x"] = (width - side) // 2 + rng.integers(0, side, len(events))
+        events["y"] = (height - side) // 2 + rng.integers(0, side, len(events))
+        events["p"] = rng.choice([-1, 1], len(events))
+    return windows
+
+
+def test_a_runner_has_compiled_all_kernels_when_it_is_made(kernel_types):
+    net, settings = SetNet.preset("small").eval(), RunSettings(600.0, form="float32")
+    runner = NetworkRunner("net", net, scenes.views(), settings)
+    counter, keep = PolarityAccumulator(runner.lookup), noise_filter.NoiseFilter(scenes.SENSOR, 1.0)
+    counter.is_watched = True
+
+    def run(events: np.ndarray, *, restart: bool) -> None:
+        counter.add(keep(events))
+        runner.begin(EventWindow(0.0, 1e6 / 600, events), restart=restart)()
+
+    run(np.zeros(50, EVENT), restart=True)
+    before = kernel_types.copy()
+    for events in local_and_other_windows():
+        run(events, restart=False)
+    assert {"scatter", "gather_interpolated"} <= {name for name, *_ in before}
+    assert kernel_types == before
+
+
 def test_loads_are_cpu_time_not_waits(recording):
     class Waiting(HighPass):
         def forward(self, *args, **kwargs):
@@ -605,8 +655,9 @@ NONSENSE = (
 
 
 async def _header(socket) -> dict:
-    """Return the header of the next message, which is whole."""
+    """Return the header of the next message, which is whole; say that it came."""
     message = await socket.receive(timeout=20)
+    await socket.send_str("received")
     assert message.type == WSMsgType.BINARY
     length = int.from_bytes(message.data[:4], "little")
     header = json.loads(message.data[4 : 4 + length])
@@ -638,6 +689,121 @@ def test_the_server_answers_and_takes_only_what_makes_sense(recording):
     refused = [answer["refused"] for answer in answers if "refused" in answer]
     assert any("views_used must be one of" in line for line in refused)
     assert not any(one["faults"] for one in headers)  # which all visitors see
+
+
+@asynccontextmanager
+async def visiting(made: PageServer):
+    """Serve, without playing; yield a visitor's socket."""
+    stop = asyncio.Event()
+    running = asyncio.create_task(made.run(lambda: None, stop))
+    await asyncio.sleep(0.2)
+    base = f"http://127.0.0.1:{made.port}"
+    async with ClientSession(base) as session, session.ws_connect("/stream") as socket:
+        yield socket
+    stop.set()
+    await running
+
+
+async def until_true(condition) -> None:
+    """Wait until `condition`, at most 20 s."""
+    end = time.monotonic() + 20
+    while not condition():
+        assert time.monotonic() < end
+        await asyncio.sleep(0.02)
+
+
+def test_a_visitor_who_takes_little_sees_the_newest_in_the_third_message(page_server):
+    page = page_server.page
+
+    async def visit() -> list[dict]:
+        async with visiting(page_server) as socket:
+            for _ in range(40):
+                show_frame(page)
+                await asyncio.sleep(1 / 30)
+            await socket.send_str('{"pause": true}')
+            await asyncio.sleep(1.0)
+            return [await _header(socket) for _ in range(3)]
+
+    headers = asyncio.run(visit())
+    assert [name for name, _ in headers[2]["pictures"]] == ["frame", "events", "slice"]
+    assert headers[2]["status"]["paused"] and headers[2]["status"]["slice_s"] > 1.0
+
+
+def test_who_answers_more_than_was_sent_gets_no_more_at_a_time(page_server):
+    async def visit() -> list[dict]:
+        async with visiting(page_server) as socket:
+            for _ in range(10):
+                await socket.send_str("received")
+            await asyncio.sleep(1.5)  # in which there are five readings of the meters
+            page_server.page.handle_request({"pause": True})
+            await asyncio.sleep(0.5)
+            return [await _header(socket) for _ in range(5)]
+
+    headers = asyncio.run(visit())
+    assert not any("refused" in header for header in headers)
+    assert headers[4]["status"]["paused"]
+
+
+def test_a_pause_does_not_wait_for_a_network_that_is_made_ready(page_server, monkeypatch):
+    page, is_ready = page_server.page, threading.Event()
+
+    def prepare(*given):
+        assert is_ready.wait(20)
+        return NetworkRunner(*given)
+
+    monkeypatch.setattr(network_runner, "NetworkRunner", prepare)
+
+    async def visit() -> None:
+        async with visiting(page_server) as socket:
+            for asked in ({"network": "net", "views": 1}, {"pause": True}, {"all_views": True}):
+                await socket.send_str(json.dumps(asked))
+            await until_true(lambda: page.all_views and page.status()["paused"])
+            await until_true(lambda: page.status()["preparing"] == {"network": "net", "views": 1})
+            assert page.status()["chosen"]["views"] == 9
+            is_ready.set()
+            await until_true(lambda: page.status()["chosen"]["views"] == 1)
+            assert page.status()["preparing"] is None
+
+    asyncio.run(visit())
+
+
+@pytest.mark.parametrize("asked", ["no json", "[1]", "[" * 4000])
+def test_a_request_that_is_no_json_object_is_told_what_one_is(page_server, asked):
+    async def visit() -> str:
+        async with visiting(page_server) as socket:
+            await socket.send_str(asked)
+            while "refused" not in (header := await _header(socket)):
+                pass
+            return header["refused"]
+
+    shown = asked if len(asked) < 40 else "[" * 40 + "..."
+    wanted = 'a request must be a JSON object such as {"pause": true}'
+    assert asyncio.run(visit()) == f"{wanted}, got {shown}"
+
+
+def test_the_hint_goes_when_no_window_is_dropped_any_more(page_server):
+    player, shown = page_server.page.player, np.zeros((88, 88), np.float32)
+    player.reader.state, player.meters.span_s = "playing", 0.5
+
+    def show_window() -> None:
+        count = player.frames.count
+        player.begun.put((EventWindow(0.0, 1.0, np.zeros(1, EVENT)), lambda: shown, None))
+        until(lambda: player.frames.count > count and not player.begun.qsize())
+
+    thread = threading.Thread(target=player.run_network, args=(player.stopped,))
+    thread.start()
+    player.reader.waiting.dropped = 7
+    for _ in range(5):
+        show_window()
+    until(lambda: player.status()["hint"] is not None)
+    time.sleep(0.6)
+    for _ in range(5):
+        show_window()
+    until(lambda: player.status()["fps"] > 0)
+    status = player.status()
+    player.stopped.set()
+    thread.join()
+    assert status["hint"] is None and status["dropped"] == 7
 
 
 def pictures(message: bytes | None) -> list[str]:
@@ -741,6 +907,17 @@ def test_a_page_s_port_in_use_is_refused(recording):
         taken.listen()
         with pytest.raises(ValueError, match=f"port={made.port} cannot be used"):
             asyncio.run(live.play_and_serve(made))
+
+
+def test_a_port_in_use_is_refused_before_networks_are_loaded(tmp_path, monkeypatch):
+    monkeypatch.setattr(live, "build_server", lambda cfg: pytest.fail("networks are loaded"))
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        cfg = config("live", tmp_path / "run", "recording=cap.raw", f"port={port}")
+        with pytest.raises(ValueError, match=f"host=127.0.0.1 port={port} cannot be used"):
+            live.live(cfg)
 
 
 def test_port_0_is_a_free_one_that_is_named(recording):

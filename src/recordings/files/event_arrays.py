@@ -23,6 +23,14 @@ def count_before(events: np.ndarray, time_us: float) -> int:
     return bisect_left(event_times(events), time_us)
 
 
+def contiguous_columns(events: np.ndarray, names: str) -> list[np.ndarray]:
+    """Return the fields of `events` of these one-letter `names`, each in an array of its own.
+
+    A field is contiguous where there are less than two events; numba compiles anew for that.
+    """
+    return [np.ascontiguousarray(events[name]) for name in names]
+
+
 def sort_events(events: np.ndarray) -> np.ndarray:
     """Return events, or times alone, by time, those of one time in their order."""
     times = np.ascontiguousarray(event_times(events))
