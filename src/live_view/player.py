@@ -32,10 +32,8 @@ class Player:
         self.running_one_view: NetworkRunner | None = None
         self.one_view: np.ndarray | None = None  # newest frame of the network on one view
         self.shown_us: float | None = None  # recorded time of the newest frame
-        self.dropped, self.dropped_s = (
-            0,
-            -math.inf,
-        )  # windows, and the wall time of the last of them
+        self.dropped = 0  # windows, when it was looked last
+        self.dropped_s = -math.inf  # wall time of the last of them
         self.begun: queue.Queue[tuple[EventWindow, Finish, Finish | None]] = queue.Queue(1)
         self.stopped = threading.Event()
         self.threads = [
