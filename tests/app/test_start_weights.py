@@ -7,8 +7,9 @@ import torch
 from torch.nn.utils import parametrize
 
 from src.app import build, entry_point, start_weights
-from src.models import files, load
+from src.models import files
 from src.models.e2vid import E2VID
+from src.models.files import load
 from src.models.network import unroll
 from src.train import train
 from tests.test_train import TINY, config

@@ -7,8 +7,9 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from src.models import files, load, save
+from src.models import files
 from src.models.e2vid import E2VID
+from src.models.files import load, save
 from src.models.network import unroll
 
 KWARGS = {"views": 2, "bins": 3, "base_channels": 4, "spectral_norm": True}
