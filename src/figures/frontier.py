@@ -54,8 +54,9 @@ def draw_accuracy_against_time(
     threads = sorted({s.threads for s in speeds if s.threads > 1})
     more = f"; lines: to {' and '.join(map(str, threads))} threads" if threads else ""
     figure.supxlabel(
-        f"ms from events to a frame of {side}x{side}, one CPU thread{more}", fontsize=10
-    )
+        f"ms from events to a frame of {side}x{side}, one CPU thread{more}",
+        fontsize=10, x=0.02, ha="left",
+    )  # fmt: skip
     clips = len({(score.severity, score.clip) for score in scores})
     figure.suptitle(f"{title}, {clips} clip{'s' * (clips != 1)}")
     _draw_legend(figure, timed)
@@ -92,9 +93,18 @@ def _draw_metric(
     axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axes.xaxis.set_major_formatter("{x:g}")
     axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.margins(0.12, 0.08)
+    axes.margins(0.12)
+    _fit_to_scores(axes, [score for _, _, score in spans.values()])
     axes.grid(alpha=0.25)
     return spans
+
+
+def _fit_to_scores(axes: Axes, scores: Sequence[float]) -> None:
+    """Let `axes` reach a little beyond the scores; long bars are cut."""
+    if scores:
+        low, high = min(scores), max(scores)
+        margin = 0.08 * (high - low or 1.0)
+        axes.set_ylim(low - margin, high + margin)
 
 
 def compute_standard_errors(metric: Column, scores: Sequence[ClipScore]) -> dict[str, float]:
@@ -142,21 +152,24 @@ def _draw_legend(figure: Figure, timed: Mapping[str, SpeedMeasurement]) -> None:
     bar: dict[str, Any] = {"marker": "|", "markersize": 11, "markeredgewidth": 0.8, "color": "0.35"}
     what = "standard error of the difference to the best"
     handles.append(Line2D([], [], ls="none", label=what, **bar))
-    place: dict[str, Any] = {"loc": "outside lower right", "ncols": 2, "columnspacing": 1}
+    place: dict[str, Any] = {"loc": "outside lower right", "ncols": 4, "columnspacing": 1}
     figure.legend(handles=handles, **place, frameon=False, fontsize=9)
 
 
 def _name_points(axes: Axes, spans: Mapping[str, Span]) -> None:
     """Write each name at the first place where it covers nothing, texts of `axes` included, and is
-    nearest to its own point, else where it covers and is near to the fewest others."""
+    nearest to its own point, else where it covers and is near to the fewest others; a bar counts
+    half."""
     to_px = axes.transData.transform
     lines = [_box(to_px((least, score)), to_px((ms, score))) for least, ms, score in spans.values()]
-    taken = lines + [drawn.get_window_extent() for drawn in (*axes.texts, *axes.collections)]
+    taken = lines + [text.get_window_extent() for text in axes.texts]
+    bars = [bar.get_window_extent() for bar in axes.collections]
     for (name, span), own in zip(spans.items(), lines, strict=True):
         written = [_write(axes, name, span, place) for place in NAME_PLACES]
         boxes = [text.get_window_extent().padded(CLEARANCE_PX) for text in written]
         faults = [
             box.count_overlaps(taken)
+            + 0.5 * box.count_overlaps(bars)
             + (not axes.bbox.x0 < box.x0 < box.x1 < axes.bbox.x1)
             + sum(_gap(box, line) <= _gap(box, own) for line in lines if line is not own)
             for box in boxes
