@@ -1,11 +1,14 @@
 """What a command line gets before the seconds of imports: its help, or what is wrong with it."""
 
+import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from src.app import console
 from src.app.help import show_help
+
+OPTION_OF_HYDRA = re.compile(r"-|\+*hydra(?!\.run\.dir=)")  # that folder is none
 
 
 def answer_before_imports(config: str, file: Path) -> None:
@@ -19,10 +22,14 @@ def answer_before_imports(config: str, file: Path) -> None:
 
 def refuse_wrong_overrides(config: str, words: Sequence[str]) -> None:
     """End the process with one line and exit code 2 for a key, a choice or a value in `words` that
-    conf/<config>.yaml does not take; words with options of Hydra, such as -m, are not looked at."""
+    conf/<config>.yaml does not take.
+
+    Words with options of Hydra, such as -m or hydra.searchpath, are left to Hydra: there may be
+    other configs, or several jobs.
+    """
     from src.app.compose import compose_checked_config  # the help does without Hydra
 
-    if any(word.startswith("-") for word in words):
+    if any(map(OPTION_OF_HYDRA.match, words)):
         return
     try:
         compose_checked_config(config, [], words)

@@ -89,8 +89,12 @@ def test_a_wrong_value_is_refused_before_the_imports_of_a_command(command):
 def test_options_of_hydra_are_not_looked_at_before_imports():
     refuse_wrong_overrides("train", ["width=1,2", "-m"])
     refuse_wrong_overrides("simulate", ["--config-name", "demo", "write=a.raw"])
-    with pytest.raises(SystemExit):
-        refuse_wrong_overrides("train", ["width=1,2"])
+    refuse_wrong_overrides("train", ["hydra.mode=MULTIRUN", "width=1,2"])
+    refuse_wrong_overrides("train", ["hydra.searchpath=[file://mine]", "experiment=mine"])
+    refuse_wrong_overrides("train", ["+hydra/launcher=joblib", "experiment=mine"])
+    for words in (["width=1,2"], ["hydra.run.dir=out/a", "width=1,2"]):
+        with pytest.raises(SystemExit):
+            refuse_wrong_overrides("train", words)
 
 
 @pytest.mark.parametrize(
