@@ -17,6 +17,16 @@ TIMED_FRAMES = 5  # by `time_frame`
 LONG_S = 0.1  # a window in which everything is due
 
 
+def _count_attention_flops(
+    query: torch.Size, key: torch.Size, value: torch.Size, *_: Any, **__: Any
+) -> int:
+    return sdpa_flop_count(query, key, value)
+
+
+# The fused attention of a CPU, which torch's FLOP counter leaves out.
+CPU_ATTENTION = {torch.ops.aten._scaled_dot_product_flash_attention_for_cpu: _count_attention_flops}
+
+
 @torch.no_grad()
 def macs_per_frame(
     network: EventToVideoNetwork, height: int, width: int, *, views: int = 1, bins: int = 5,
@@ -41,16 +51,6 @@ def count_macs(work: Callable[[], object]) -> int:
     with FlopCounterMode(display=False, custom_mapping=CPU_ATTENTION) as counter:
         work()
     return counter.get_total_flops() // 2
-
-
-def _count_attention_flops(
-    query: torch.Size, key: torch.Size, value: torch.Size, *_: Any, **__: Any
-) -> int:
-    return sdpa_flop_count(query, key, value)
-
-
-# The fused attention of a CPU, which torch's FLOP counter leaves out.
-CPU_ATTENTION = {torch.ops.aten._scaled_dot_product_flash_attention_for_cpu: _count_attention_flops}
 
 
 class Timing(NamedTuple):
