@@ -102,6 +102,13 @@ def in_float32(monkeypatch):
     monkeypatch.setattr(openvino_network, "fastest_dtype", lambda: torch.float32)
 
 
+@pytest.fixture
+def two_batch_sizes(monkeypatch):
+    """Each size is compiled, for each network and frame: two of five."""
+    monkeypatch.setattr(setnet_tiles, "BATCHES", (8, 32))
+
+
+@pytest.mark.usefixtures("in_float32", "two_batch_sizes")
 @pytest.mark.parametrize("backend", FORMS)
 @settings(
     max_examples=12,
@@ -121,9 +128,7 @@ def in_float32(monkeypatch):
     fps=st.sampled_from([120.0, 317.0, 600.0, 3000.0, 12000.0]),
     seed=st.integers(0, 999),
 )
-def test_any_activity_gives_the_dense_frames(
-    backend, name, kinds, size, views, fps, seed, in_float32
-):
+def test_any_activity_gives_the_dense_frames(backend, name, kinds, size, views, fps, seed):
     height, width = size
     net, windows = NETWORKS[name], scene(kinds, seed, views, height, width, fps)
     live = EventListRuntime(

@@ -118,7 +118,8 @@ def spread(supported, spans, weights, evidence, is_near, near_tiles):
         if first == stop:
             continue
         line[first : stop + 4 * reach] = 0
-        line[first + 2 * reach : stop + 2 * reach] = supported[r, first:stop]
+        for x in range(first, stop):  # an array assigned to a slice takes seconds to compile
+            line[2 * reach + x] = supported[r, x]
         supported[r, first:stop] = 0
         begin, end = max(first - reach, 0), min(stop + reach, columns)
         n, smooth, given = np.uint64(end - begin), smoothed[begin:end], line[begin + reach :]

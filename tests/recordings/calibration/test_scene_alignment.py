@@ -110,9 +110,13 @@ def test_windows_of_noise_alone_are_refused():
         align_views_by_scene(noise, SceneTarget(), (88, 88))
 
 
-def test_mirrors_off_the_right_angle_give_corner_views_in_halves(tmp_path):
+@pytest.mark.parametrize(
+    "views",
+    [pytest.param(4, id="2x2"), pytest.param(9, id="3x3", marks=pytest.mark.slow)],
+)
+def test_mirrors_off_the_right_angle_give_corner_views_in_halves(views, tmp_path):
     path = tmp_path / "scene.raw"
-    truth = record(path, layout(9), [moving_scene()], key=9, angle_rad=0.03)
+    truth = record(path, layout(views), [moving_scene()], key=9, angle_rad=0.03)
     pictures = activity_pictures.read_activity_pictures(path)
     found = align_views_by_scene(pictures, SceneTarget(), (88, 88))
     there = found.aligned.views

@@ -416,7 +416,8 @@ def timestamp_us(u, clock):
 def initialise_pixel_state(clip, key, work):
     """Let the memory begin with its levels, the references off from them by what is drawn."""
     level, reference, drawn = work.level, work.reference, work.drawn
-    work.source[:], reference[:], work.dead[:] = level, level, f32(0)
+    for x in range(level.size):  # an array assigned to a slice takes numba a second more to compile
+        work.source[x], reference[x], work.dead[x] = level[x], level[x], f32(0)
     if clip.reference_span > 0:
         draw_uint32_per_pixel(key, 1, 0, work.pixel, drawn)
         for x in range(level.size):
@@ -450,7 +451,7 @@ def advance_interval(given, clip, hot_count, work, output, place, intensity, key
     if clip.leak:
         compute_leak_drift(clip.leak, work, frame)
     steps = count_v2e_steps(mode, work) if given.v2e_stamps else np.int64(1)
-    done, last = 0, list_active_pixels(mode, work)
+    done, last = np.int64(0), list_active_pixels(mode, work)
     if clip.dark_noise or clip.hot_noise:
         draw_noise_events(work, key, frame, last)
     while done < last:
@@ -460,7 +461,8 @@ def advance_interval(given, clip, hot_count, work, output, place, intensity, key
     if clip.leak:
         for x in range(level.size):
             reference[x] -= drift[x]
-    level[:] = new
+    for x in range(level.size):
+        level[x] = new[x]
     for x in range(level.size):
         dead[x] = max(dead[x] - f32(1), f32(0))
 
@@ -504,7 +506,7 @@ def simulate_pixel_blocks(
         fill_pixel_numbers(clip, given.width, a, work.pixel)
         hot_count = draw_thresholds_and_hot_pixels(clip, keys, normals, work)
         prehash_pixels(key, work.pixel, work.mixed)
-        doubtful |= read_frame(given, half_frames, place, 0, work, work.level)[1]
+        doubtful |= read_frame(given, half_frames, place, np.int64(0), work, work.level)[1]
         initialise_pixel_state(clip, keys[REFERENCE_KEY], work)
         for i in range(edges_us.size - 1):
             # The interval's window, where that begins, bins per microsecond, and both edges.
