@@ -143,7 +143,15 @@ def test_wind_moves_the_field_smoothly():
     assert second.square().mean() < 0.1 * first.square().mean()  # AR(1) gives about 3
 
 
-@pytest.mark.parametrize("strength, decibels", [(1.0, 50.0), (2.0, 45.0), (4.0, 42.0), (6.0, 38.0)])
+@pytest.mark.parametrize(
+    "strength, decibels",
+    [
+        pytest.param(1.0, 50.0, marks=pytest.mark.slow),
+        (2.0, 45.0),
+        pytest.param(4.0, 42.0, marks=pytest.mark.slow),
+        (6.0, 38.0),
+    ],
+)
 @pytest.mark.parametrize(
     "pixel", [0.04, *(pytest.param(pixel, marks=pytest.mark.slow) for pixel in (0.16, 0.4))]
 )
