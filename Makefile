@@ -19,7 +19,7 @@ train: $(READY) $(LPIPS)
 	$(PY) -m src.train experiment=lf3x3 budget=fine_tuning
 
 test: $(READY) $(LPIPS)
-	OMP_NUM_THREADS=1 $(PY) -m pytest -q -n 2 -m "not slow and not gpu"
+	OMP_NUM_THREADS=1 $(PY) -m pytest -q -n 2 --dist worksteal -m "not slow and not gpu"
 
 test-all: $(READY) $(LPIPS)
 	$(PY) -m pytest -q
