@@ -7,9 +7,15 @@ from torch import Tensor, nn
 
 
 def learn_by_heart(
-    network: nn.Module, draw: Callable[[], Tensor], target: Tensor, rate: float, steps: int
-) -> float:
-    """Return the last mean square error of what `draw` makes over the first, after Adam's steps."""
+    network: nn.Module,
+    draw: Callable[[], Tensor],
+    target: Tensor,
+    rate: float,
+    steps: int,
+    ratio: float,
+) -> bool:
+    """Return whether the mean square error of what `draw` makes falls below `ratio` of the first,
+    five of Adam's steps in a row, in at most `steps`."""
     optimizer, losses = torch.optim.Adam(network.parameters(), rate), []
     for _ in range(steps):
         loss = (draw() - target).square().mean()
@@ -17,4 +23,6 @@ def learn_by_heart(
         loss.backward()
         optimizer.step()
         losses.append(float(loss.detach()))
-    return losses[-1] / losses[0]
+        if max(losses[-5:]) < ratio * losses[0]:
+            return True
+    return False

@@ -102,4 +102,4 @@ def test_it_can_learn_one_batch_by_heart(subject):
     target = torch.rand(clips * length, 1, side, side, generator=torch.Generator().manual_seed(2))
     target = avg_pool2d(target, 5, 1, 2).unflatten(0, (clips, length))
     draw = lambda: unroll(network, windows)[0]  # noqa: E731
-    assert learn_by_heart(network, draw, target, rate, steps) < ratio
+    assert learn_by_heart(network, draw, target, rate, steps, ratio)
