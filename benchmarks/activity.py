@@ -1,8 +1,8 @@
 """Time of a window against where events fall: python -m benchmarks.activity
 
 One line for each network and size: milliseconds, the median of some windows, with events in 0, 5,
-10, 25, 50, 75 and 100 % of the tiles of 32 x 32 pixels, a block around the middle, 300 events a
-window in each, over all views.  `--figure FILE` draws them.
+10, 25, 50, 75 and 100 % (rounded up to whole ones) of the tiles of 32 x 32 pixels, a block around
+the middle, 300 events a window in each, over all views.  `--figure FILE` draws them.
 """
 
 import argparse
@@ -39,12 +39,18 @@ def windows(share: float, views: int, height: int, width: int, fps: float, count
     rng, corners, made = np.random.default_rng(0), block(share, height, width), []
     for k in range(count):
         places = np.repeat(np.array(corners, int).reshape(-1, 2), EVENTS, 0)
-        places = (places + rng.integers(0, TILE_PX, places.shape)).clip(0, (height - 1, width - 1))
+        inside = np.minimum(TILE_PX, (height, width) - places)  # of a tile that the border cuts
+        places += (inside * rng.random(places.shape)).astype(int)
         n, edges = len(places), (k / fps, (k + 1) / fps)
         y, x = places[rng.permutation(n)].T
         p, view = 2 * rng.integers(0, 2, n) - 1, rng.integers(0, views, n)
         made.append((np.sort(rng.uniform(*edges, n)), x, y, p, view, *edges))
     return made
+
+
+def covered_share(share: float, height: int, width: int) -> float:
+    """Return the share of the tiles that `block` gives."""
+    return len(block(share, height, width)) / len(block(1.0, height, width))
 
 
 def describe_size(views: int, height: int, width: int, fps: float) -> str:
@@ -53,7 +59,7 @@ def describe_size(views: int, height: int, width: int, fps: float) -> str:
     return f"{views} x {width} x {height}, {fps:.0f} windows/s\n{most:,} events a window at 100 %"
 
 
-def draw(path: Path, measured: dict[tuple[str, str], list[float]]) -> None:
+def draw(path: Path, measured: dict[tuple[str, str], dict[float, float]]) -> None:
     """Draw milliseconds against the share, a panel for each size and a line for each network."""
     sizes = list(dict.fromkeys(size for _, size in measured))
     figure = Figure(figsize=(3.2 * len(sizes), 2.8), layout="constrained")
@@ -61,7 +67,8 @@ def draw(path: Path, measured: dict[tuple[str, str], list[float]]) -> None:
     for size, axes in zip(sizes, panels, strict=True):
         for (name, its_size), times in measured.items():
             if its_size == size:
-                axes.plot([100 * share for share in SHARES], times, marker="o", label=name)
+                percent = [100 * share for share in times]
+                axes.plot(percent, list(times.values()), marker="o", label=name)
         axes.set(title=size, xlabel="share of the frame with events, %", ylim=(0, None))
     panels[0].set_ylabel("ms a window")
     panels[0].legend(frameon=False)
@@ -78,20 +85,21 @@ def main() -> None:
     parser.add_argument("--figure", type=Path, help="a file for the figure, .png or .svg")
     given = parser.parse_args()
     form, measured = fastest_form(), {}
-    print(f"{form}, {given.threads} threads; ms at", *(f"{share:.0%}" for share in SHARES))
+    print(f"{form}, {given.threads} threads; share of the tiles: ms")
     for name in given.names:
         network = load(name)
         for views, height, width, fps in SIZES:
             how = {"positions": layout(views), "height": height, "width": width}
             live = EventListRuntime(network, **how, threads=given.threads, form=form)
-            found = []
+            found: dict[float, float] = {}
             for share in SHARES:
                 live.reset()
                 played = windows(share, views, height, width, fps, given.windows)
                 times = milliseconds(live.step, played, given.seconds, time.perf_counter)
-                found.append(statistics.median(times))
+                found[covered_share(share, height, width)] = statistics.median(times)
             size = describe_size(views, height, width, fps)
-            print(f"{name}, {size.splitlines()[0]}:", *(f"{ms:7.2f}" for ms in found), flush=True)
+            line = (f"{share:.0%}: {ms:.2f}" for share, ms in found.items())
+            print(f"{name}, {size.splitlines()[0]}:", ", ".join(line), flush=True)
             measured[name, size] = found
     if given.figure:
         draw(given.figure, measured)

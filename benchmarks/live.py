@@ -1,9 +1,10 @@
 """The live chain at full load, page and a visitor included: python -m benchmarks.live
 
-Limits, with setnet_small on nine views of 176x176, 600 windows and 5 million events a second, on
-two threads for 60 s: no window dropped; from the end of a window to its frame in the page's buffer
-5 ms in the median, 10 ms at 99 %; the page at 30 pictures a second 5 % of a core.  Events are
-uniform over the views of a 1280x720 sensor, the worst case for a cache.
+Goals, with setnet_small on nine views of 176x176, 600 windows and 5 million events a second, for 60
+s, which two cores without AMX do not reach (docs/live.md): no window dropped; from the end of a
+window to its frame in the page's buffer 5 ms in the median, 10 ms at 99 %; the page at 30 pictures
+a second 5 % of a core. Events are uniform over the views of a 1280x720 sensor, the worst case for a
+cache.
 """
 
 import argparse

@@ -32,7 +32,6 @@ from src.recordings.files.recording import read_events
 from src.sim.optics import layout
 
 SIDE, FPS, RATE = 176, 600, 5e6
-FORM = "bf16" if is_bf16_faster() else "float32"
 NAMES = ("setnet_small", "setnet_medium", "lf3x3")
 
 
@@ -85,9 +84,12 @@ def line(name: str, times: list[float], giga: float, peak: float) -> str:
     return f"{name:32s} {median:6.2f} ms ({low:.2f} to {high:.2f}), mean {mean:.2f}  {share}"
 
 
-def measured(name: str, engine: str, count: int, played: list[tuple], seconds: float) -> str:
-    """Return the line of a network on `engine`, openvino or pytorch, and `count` threads."""
-    peak = measure_peak_conv_macs_per_s(FORM_DTYPES[FORM], threads=count) / 1e9
+def measured(
+    name: str, engine: str, form: str, count: int, played: list[tuple], seconds: float
+) -> str:
+    """Return the line of a network on `engine`, openvino or pytorch, and `count` threads; PyTorch
+    computes in `form`, float32 or bf16."""
+    peak = measure_peak_conv_macs_per_s(FORM_DTYPES[form], threads=count) / 1e9
     network = load(name)
     size = {"positions": layout(9), "height": SIDE, "width": SIDE}
     if engine == "openvino":
@@ -95,7 +97,7 @@ def measured(name: str, engine: str, count: int, played: list[tuple], seconds: f
         step = EventListRuntime(network, **size, threads=count, form="openvino").step
     else:
         giga = macs_per_frame(network, SIDE, SIDE, views=9) / 1e9
-        fast = convert_to_form(network, FORM)
+        fast = convert_to_form(network, form)
         step = build_grid_step(fast, 9, SIDE, SIDE, window_s=1 / FPS)
     clock = time.process_time if count == 1 else time.perf_counter
     with torch_threads(count):
@@ -111,15 +113,15 @@ def main() -> None:
     parser.add_argument("--threads", type=whole_number, nargs="+", default=[1, 2])
     parser.add_argument("--seconds", type=positive_number, default=4.0)
     given = parser.parse_args()
-    played = windows(given.recording)
+    played, form = windows(given.recording), "bf16" if is_bf16_faster() else "float32"
     mean = statistics.mean(len(window[0]) for window in played)
     print(f"{len(played)} windows of 1/{FPS} s, {mean:.0f} events each over nine views of {SIDE}")
     for count in given.threads:
         kind = "CPU" if count == 1 else "wall"
-        print(f"threads: {count}, {kind} time, median (10 to 90 %), convolutions in {FORM}")
+        print(f"threads: {count}, {kind} time, median (10 to 90 %), convolutions in {form}")
         for name, engine in product(given.names, ("openvino", "pytorch")):
             with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as alone:
-                told = alone.submit(measured, name, engine, count, played, given.seconds)
+                told = alone.submit(measured, name, engine, form, count, played, given.seconds)
                 print(told.result(), flush=True)
 
 

@@ -1,15 +1,14 @@
 """Turbulence for nine views: python -m benchmarks.turbulence [what ...] [another checkout]
 
 `table`: ms a frame of 256x256, clips of 4 frames, two threads, where turbulence is local: a pixel
-of 0.04 to 0.4 D at the object, D/r0 0.5 to 4, D^2 / (lambda L) = 4.7, so lambda / D is
-0.21 / pixel.  Limits: 60 ms at 0.08 D and more, 1.5 GB.  `prior`: seconds of one thread for a
-training clip, 25 frames of 80x80, over the turbulence that training draws; limit 0.6 s on average.
-These two by default.  Another checkout of this repository, an older one say, is timed beside this
-one: the two take turns.  Times are wall time in `table`, the least of three, and CPU time of the
-thread in `prior`.  `launches`: what a device has to do for a clip of a cache, 41 frames of 144x144,
-over the same turbulence: operators, gigabytes they read and write and products, and the ms that
-LAUNCH_S, BYTES_S and PRODUCTS_S make of these, an H100's; limit 8 ms.  With CUDA: those ms as they
-are.
+of 0.04 to 0.4 D at the object, D/r0 0.5 to 4, D^2 / (lambda L) = 4.7, so lambda / D is 0.21 /
+pixel. Limits: 60 ms at 0.08 D and more, 1.5 GB. `prior`: seconds of one thread for a training clip,
+25 frames of 80x80, over the turbulence that training draws; limit 0.6 s on average. These two by
+default. Another checkout of this repository, of version 0.2 or later, is timed beside this one: the
+two take turns. Times are wall time in `table`, the least of three, and CPU time of the thread in
+`prior`. `launches`: what a device has to do for a clip of a cache, 41 frames of 144x144, over the
+same turbulence: operators, gigabytes they read and write and products, and the ms that LAUNCH_S,
+BYTES_S and PRODUCTS_S make of these, an H100's; limit 8 ms. With CUDA: those ms as they are.
 """
 
 import argparse
@@ -29,7 +28,6 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from scripts.parallel_fill import prepare_turbulence
 from src.sim.turbulence import Atmosphere, Turbulence, sample_atmosphere
 
 APERTURE_M, WAVELENGTH_M, FRESNEL = 0.1, 525e-9, 4.7
@@ -77,10 +75,13 @@ def draw_atmospheres() -> list[Atmosphere]:
 
 
 class Checkout:
-    """A process that times the code of one checkout, when asked to."""
+    """A process that times the code of one checkout, when asked to.
+
+    It runs this file, which therefore imports above only what versions from 0.2 on have.
+    """
 
     def __init__(self, root: Path):
-        here = Path(__file__).resolve()
+        self.root, here = root, Path(__file__).resolve()
         self.process = subprocess.Popen(
             [sys.executable, str(here), "serve"],
             cwd=root,
@@ -91,9 +92,15 @@ class Checkout:
         )
 
     def __call__(self, work: str, *numbers: object) -> float:
-        """Return what `work` (frame_ms, clip_s or memory_gb) gives for the numbers."""
-        print(json.dumps([work, *numbers]), file=self.process.stdin, flush=True)
-        return json.loads(self.process.stdout.readline())
+        """Return what `work` (frame_ms, clip_s or memory_gb) gives for the numbers.
+
+        Raises ValueError where the process has ended, on code that this file does not fit.
+        """
+        try:
+            print(json.dumps([work, *numbers]), file=self.process.stdin, flush=True)
+            return json.loads(self.process.stdout.readline())
+        except (BrokenPipeError, json.JSONDecodeError):
+            raise ValueError(f"{self.root}: this checkout cannot be timed (see above)") from None
 
 
 def memory_gb() -> float:
@@ -188,6 +195,8 @@ def launches() -> None:
 
 def prepare_clips() -> list:
     """Return random turbulence as training sees it, ready for a device."""
+    from scripts.parallel_fill import prepare_turbulence
+
     operators = [Turbulence(path, views=9, height=256, width=256) for path in draw_atmospheres()]
     return [
         prepare_turbulence(one, CACHED[1], torch.Generator().manual_seed(0), CROP)
@@ -230,4 +239,9 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    serve() if sys.argv[1:] == ["serve"] else main()
+    if sys.argv[1:] == ["serve"]:
+        serve()
+    else:
+        from src.app.script import run_script
+
+        run_script(main)

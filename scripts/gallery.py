@@ -63,7 +63,7 @@ def unseen(recording: str, size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
 
 
 def gallery(recordings: list[str], networks: list[str], published: Path | None) -> Figure:
-    """Draw a row of last frames for each recording."""
+    """Draw a row of last frames for each recording, and print their invented contrast."""
     rows = [[last(recording, name, published) for name in networks] for recording in recordings]
     seen = [
         camera(recording, row[-1].time_s) for recording, row in zip(recordings, rows, strict=True)
@@ -75,18 +75,21 @@ def gallery(recordings: list[str], networks: list[str], published: Path | None) 
     grid = figure.subplots(len(rows), columns, squeeze=False, height_ratios=heights)
     for recording, row, picture, axes in zip(recordings, rows, seen, grid, strict=True):
         pictures = [*(frame.picture for frame in row), picture]
-        unseen_px = unseen(recording, row[0].picture.shape)
+        unseen_px, values = unseen(recording, row[0].picture.shape), []
         for panel, shown in zip(axes, pictures, strict=False):
             panel.set(xticks=[], yticks=[])
             if shown is not None and shown is not picture:
                 value = invented_contrast(shown, unseen_px)
-                panel.set_xlabel("" if np.isnan(value) else f"{value:.3f}", fontsize=7)
+                values.append("" if np.isnan(value) else f"{value:.3f}")
+                panel.set_xlabel(values[-1], fontsize=7)
             if shown is not None:
                 panel.imshow(shown, cmap="gray", vmin=0, vmax=1)
             else:
                 panel.set_axis_off()
         path = Path(recording.partition("@")[0])
-        axes[0].set_ylabel(path.parent.name if path.stem == "events" else path.stem, fontsize=7)
+        name = path.parent.name if path.stem == "events" else path.stem
+        axes[0].set_ylabel(name, fontsize=7)
+        print("| " + " | ".join([name, *values]) + " |")
     for panel, name in zip(grid[0], [*networks, "camera"], strict=False):
         panel.set_title(name, fontsize=9)
     return figure
@@ -105,6 +108,8 @@ def main() -> None:
     unknown = [name for name in given.networks if BASELINES.get(name) and not given.published]
     if unknown:
         parser.error(f"--networks {' '.join(unknown)} needs --published")
+    print("| " + " | ".join(["invented contrast", *given.networks]) + " |")
+    print("|---|" + "---|" * len(given.networks))
     plots.save_figure(gallery(given.recordings, given.networks, given.published), given.out)
 
 

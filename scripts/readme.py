@@ -137,7 +137,7 @@ def reconstruct_clip(network: Candidate, sample: Sample) -> Tensor:
     return network.reconstruct(sample.voxels[0, :, None], positions, float(sample.window_s[0]))[0]
 
 
-def score_clips_into_metrics(cfg: DictConfig, rows: dict[str, Candidate]) -> dict[str, list[dict]]:
+def score_clips(cfg: DictConfig, rows: dict[str, Candidate]) -> dict[str, list[dict]]:
     """Return the scores of all `rows` on each of the test clips of `cfg`, and what a clip shows
     (`source`)."""
     pipeline, measure = simulation.build_pipeline(cfg, "test"), build_metrics(cfg)
@@ -270,7 +270,7 @@ def main() -> None:
     cards = {name: row for row, (name, _) in reversed(ROWS.items())}  # the row of most views
     for protocol, overrides in asked.items():
         shown = {row for table in TABLES[protocol] for row in table.all_rows}
-        values = score_clips_into_metrics(
+        values = score_clips(
             compose_config("eval", *protocol.split(), *overrides),
             {row: network for row, network in rows.items() if row in shown},
         )

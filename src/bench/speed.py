@@ -205,13 +205,13 @@ def _draw_windows(entry: SpeedMeasurement) -> list[tuple[Any, ...]]:
 
 @torch.no_grad()
 def time_postprocessor(post: FramePostprocessor, side: int, *, threads: int = 1) -> float:
-    """Return the ms for each frame, `side` pixels square, of a long video.
+    """Return the ms for each frame, `side` pixels square, of a long video; the median of three.
 
     Its windows of WINDOW frames overlap by OVERLAP: what two of them share is paid for twice.
     """
     frames = torch.rand(1, post.WINDOW, 1, side, side)
-    took = time_calls(lambda: post.restore(frames), threads=threads, seconds=0, min_calls=2)
-    return took.least_ms / (post.WINDOW - post.OVERLAP)
+    took = time_calls(lambda: post.restore(frames), threads=threads, seconds=0, min_calls=3)
+    return took.median_ms / (post.WINDOW - post.OVERLAP)
 
 
 @torch.no_grad()

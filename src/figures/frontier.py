@@ -109,21 +109,25 @@ def _fit_to_scores(axes: Axes, scores: Sequence[float]) -> None:
 
 def compute_standard_errors(metric: Column, scores: Sequence[ClipScore]) -> dict[str, float]:
     """Return {network: standard error of its mean difference of `metric` to the best network's},
-    over the clips of both; none where they are fewer than two.
+    over the clips of both, those of one number as one: they show the same in each severity.  None
+    where they are fewer than two.
     """
-    values: dict[str, dict[tuple[str, int], float]] = {}
+    values: dict[str, dict[tuple[int, str], float]] = {}
     for score in scores:
         value = score.values[metric.name]
         if value is not None and np.isfinite(value):
-            values.setdefault(score.network, {})[score.severity, score.clip] = value
+            values.setdefault(score.network, {})[score.clip, score.severity] = value
     if not values:
         return {}
     best = max(values.values(), key=lambda own: metric.better * np.mean(list(own.values())))
     found = {}
     for name, own in values.items():
-        more = [own[clip] - best[clip] for clip in own.keys() & best.keys()]
+        more: dict[int, list[float]] = {}
+        for clip, severity in sorted(own.keys() & best.keys()):
+            difference = own[clip, severity] - best[clip, severity]
+            more.setdefault(clip, []).append(difference)
         if len(more) > 1:
-            found[name] = compute_standard_error(more)
+            found[name] = compute_standard_error([float(np.mean(each)) for each in more.values()])
     return found
 
 
