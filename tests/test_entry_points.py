@@ -7,15 +7,17 @@ import runpy
 import signal
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import pytest
 import torch
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 
+from src.app import entry_point
 from src.app.entry_point import run_main
 from tests.conftest import ROOT
-from tests.faults.harness import Run, run_entry_point
+from tests.faults.harness import Run, run_entry_point, run_program
 from tests.faults.test_kills import resolved
 
 SCRIPTS = [
@@ -57,23 +59,35 @@ def test_every_script_prints_its_help_and_refuses_an_unknown_option(file, capsys
     assert "usage: " in capsys.readouterr().err
 
 
-def test_only_what_trains_and_scores_loads_lightning_and_torchmetrics():
-    """They, and the writer of RAW files, take as long to load as all else that a command needs."""
+@pytest.fixture(scope="module")
+def program() -> list[str]:
+    """What a program says that uses the package, then imports what neither trains nor scores:
+    whether its own errors are shown, and the modules."""
     commands = "calibrate convert live reconstruct report simulate"
-    code = f"import sys, src.{commands.replace(' ', ', src.')}; print(*sys.modules)"
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT
+    code = (
+        "import sys, lightfield_events as l; l.layout; "
+        "print(sys.excepthook is sys.__excepthook__); "
+        f"import src.{commands.replace(' ', ', src.')}; print(*sys.modules)"
     )
-    assert not {"lightning", "torchmetrics", "faery"} & set(done.stdout.split())
+    ask = {"capture_output": True, "text": True, "check": True, "cwd": ROOT}
+    return subprocess.run([sys.executable, "-c", code], **ask).stdout.splitlines()
+
+
+def test_only_what_trains_and_scores_loads_lightning_and_torchmetrics(program):
+    """They, and the writer of RAW files, take as long to load as all else that a command needs."""
+    assert not {"lightning", "torchmetrics", "faery"} & set(program[-1].split())
+
+
+def test_a_program_that_uses_the_package_keeps_its_own_errors(program):
+    assert program[0] == "True"
 
 
 def test_a_wrong_value_is_one_line_and_exit_code_2_of_the_process(tmp_path):
     words = [*TINY, "data.crop=1000", f"paths.out={tmp_path}"]
-    line = [sys.executable, "-m", "src.train", *words]
-    done = subprocess.run(line, cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 2, done.stderr
-    (line,) = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
-    assert "data.crop must be in 8..72" in line and "Traceback" not in done.stderr
+    run = Run(tmp_path / "log", run_program, "train", *words)
+    assert run.wait() == 2, run.text()
+    (line,) = [line for line in run.text().splitlines() if line.startswith("error: ")]
+    assert "data.crop must be in 8..72" in line and "Traceback" not in run.text()
     assert not list(tmp_path.rglob("results.json"))
 
 
@@ -110,21 +124,16 @@ def test_ctrl_c_while_modules_are_imported_is_one_line(command, tmp_path):
     assert (done.returncode, done.stderr) == (-signal.SIGINT, "stopped\n")  # of a shell: 130
 
 
-def test_a_program_that_uses_the_package_keeps_its_own_errors():
-    code = (
-        "import sys, lightfield_events as l; l.layout; assert sys.excepthook is sys.__excepthook__"
-    )
-    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT).returncode == 0
+def warn_of_files() -> None:
+    """Warn as from a file of ours and as from one of another package."""
+    for file in (entry_point.__file__, "/site-packages/other.py"):
+        warnings.warn_explicit(f"late in {file}", UserWarning, file, 3)
 
 
-def test_a_warning_of_ours_is_one_line():
-    code = (
-        "import warnings; from src.app import entry_point as e; e.run_main(lambda: ["
-        "warnings.warn_explicit(f'late in {file}', UserWarning, file, 3)"
-        " for file in (e.__file__, '/site-packages/other.py')])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
-    ours, other = done.stderr.splitlines()
+def test_a_warning_of_ours_is_one_line(tmp_path):
+    run = Run(tmp_path / "log", warn_of_files)
+    assert run.wait() == 0
+    ours, other = run.text().splitlines()
     assert ours.startswith("warning: late in /")
     assert other.startswith("/site-packages/other.py:3: UserWarning: ")
 

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterable
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -24,9 +25,9 @@ from src.sim.pipeline import Pipeline, crop_frames
 from src.sim.sensor import EventSensor
 from src.training.clip_cache import CachedClip, CachedPipeline, DeviceClipCache
 from src.training.disk_cache import DiskClipCache
-from tests.faults.harness import FORKS
+from tests.faults.harness import FORKS, Run
 from tests.sim.test_pipeline import Waves
-from tests.training.cache_sources import Broken, Growing, Other, Telling, source
+from tests.training.cache_sources import Broken, Growing, Other, Telling, fill_for_ever, source
 from tests.training.test_disk_cache import runs, until
 
 
@@ -49,7 +50,7 @@ def nobody_draws() -> bool:
     return not multiprocessing.active_children()
 
 
-def test_clips_are_those_of_a_disk_cache_and_drawn_without_the_device(tmp_path):
+def test_clips_are_those_of_a_disk_cache_and_drawn_without_the_device(imported, tmp_path):
     of = source(Telling(tmp_path / "told"))
     stored, report = made(of, range(7), workers=2)
     assert (tmp_path / "told").read_text() == "False ''"
@@ -155,21 +156,38 @@ def test_nothing_to_do_and_no_one_to_do_it():
         made(source(), range(3), workers=-1)
 
 
-@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
-def test_stopped_from_outside_all_end(how, tmp_path):
+def drawing_for(told: Path) -> list[int]:
+    """Return the numbers of the two processes that draw, once they do."""
+    until(told.exists)
+    drawing = [int(pid) for pid in told.read_text().split()]
+    assert len(drawing) == 2 and all(map(runs, drawing))
+    return drawing
+
+
+def test_stopped_from_outside_all_end(tmp_path):
     told = tmp_path / "pids"
     call = f"from tests.training import cache_sources; cache_sources.fill_for_ever({str(told)!r})"
     asking = subprocess.Popen(
         [sys.executable, "-c", call], start_new_session=True, stderr=subprocess.DEVNULL
     )
-    until(told.exists)
-    drawing = [int(pid) for pid in told.read_text().split()]
-    assert len(drawing) == 2 and all(map(runs, drawing))
-    if how == signal.SIGINT:
-        os.killpg(asking.pid, how)  # Ctrl-C reaches all of them
-    else:
-        asking.terminate()
+    drawing = drawing_for(told)
+    os.killpg(asking.pid, signal.SIGINT)  # Ctrl-C reaches all of them
     assert asking.wait(600) != 0
+    until(lambda: not any(map(runs, drawing)))
+
+
+def fill_and_end_at_once(told: str) -> None:
+    """Fill for ever, in a process that a signal ends with nothing closed."""
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    parallel_fill._forkserver = lambda: FORKS
+    fill_for_ever(told)
+
+
+def test_terminated_from_outside_all_end(tmp_path):
+    told = tmp_path / "pids"
+    asking = Run(tmp_path / "log", fill_and_end_at_once, str(told))
+    drawing = drawing_for(told)
+    assert asking.stop(signal.SIGTERM) == -signal.SIGTERM
     until(lambda: not any(map(runs, drawing)))
 
 

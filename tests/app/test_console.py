@@ -8,6 +8,7 @@ import select
 import subprocess
 import sys
 import time
+import warnings
 from unittest.mock import Mock
 
 import pytest
@@ -21,6 +22,7 @@ from src.app.help import help_text
 from src.records.results import ScoreRow, build_rich_score_table, describe_score_difference
 from src.training.progress import TrainingProgress
 from tests.conftest import ROOT
+from tests.faults.harness import Run, run_program
 from tests.test_entry_points import run_here
 from tests.test_train import config
 
@@ -189,16 +191,31 @@ def test_of_an_error_in_a_worker_the_line_is_printed(capsys, monkeypatch):
     assert said == "error: scene.root must hold photographs, got a.png\n" and ended.value.code == 2
 
 
+def train_at_terminal(name: str, *words: str) -> None:
+    """Run src.train with the terminal `name` as that of its process."""
+    os.setsid()
+    terminal = os.open(name, os.O_RDWR)  # which is now that of the session
+    for number in range(3):
+        os.dup2(terminal, number)
+    streams = {number: os.fdopen(number, "w", buffering=1) for number in (1, 2)}
+    sys.stdout, sys.stderr = streams.values()
+    warnings.simplefilter("ignore")
+    run_program("train", *words)
+
+
 def test_ctrl_c_at_a_terminal_ends_in_one_line(tmp_path):
     words = [*SMALL, f"hydra.run.dir={tmp_path}"]
-    child, terminal = pty.fork()
-    if child == 0:
-        os.chdir(ROOT)
-        os.execv(sys.executable, [sys.executable, "-W", "ignore", "-m", "src.train", *words])
-    before = read_until(terminal, b" of 5000 loss", 400)
-    os.write(terminal, b"\x03")
-    after = read_until(terminal, b"never", 100).decode()
-    _, status = os.waitpid(child, 0)
-    assert b"testing untrained" in before and os.waitstatus_to_exitcode(status) == 130
+    terminal, of_child = pty.openpty()
+    run = Run(tmp_path / "log", train_at_terminal, os.ttyname(of_child), *words)
+    try:
+        before = read_until(terminal, b" of 5000 loss", 400)
+        os.close(of_child)
+        os.write(terminal, b"\x03")
+        after = read_until(terminal, b"never", 100).decode()
+        code = run.wait(100)
+    finally:  # or it trains on when a test has failed
+        run.process.kill()
+        os.close(terminal)
+    assert b"testing untrained" in before and code == 130
     assert "Traceback" not in after and "DataLoader" not in after
     assert len(re.findall(r"stopped at step \d+; go on with ckpt=", after)) == 1

@@ -2,39 +2,31 @@
 
 import os
 import signal
-import subprocess
-import sys
-from pathlib import Path
+import time
+import weakref
 
 import pytest
 
 from src.app.stop_signals import TERMINATING, StoppedBySignal, stop_by_signals
+from tests.faults.harness import Run
 
-ROOT = Path(__file__).resolve().parents[2]
-DROPPED = """
-import signal, time, weakref
-from src.app import entry_point
 
-class Kept: pass
+class Kept:
+    """What a weak reference can be to."""
 
-if NUMBER != signal.SIGINT:
-    signal.signal(NUMBER, signal.SIG_DFL)  # not ignored as under nohup
 
-def work():
+def drop_in_a_callback(number: int) -> None:
+    """Send a signal from a callback, of which Python drops what it raises."""
     kept = Kept()
-    reference = weakref.ref(kept, lambda _: signal.raise_signal(NUMBER))
-    del kept  # Python drops what the callback raises
+    _reference = weakref.ref(kept, lambda _: signal.raise_signal(number))
+    del kept
     time.sleep(20)
-
-entry_point.run_main(work)
-"""
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, *TERMINATING])
-def test_a_signal_in_a_callback_of_python_is_not_lost(number):
-    code = DROPPED.replace("NUMBER", str(int(number)))
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (128 + number, "stopped\n")
+def test_a_signal_in_a_callback_of_python_is_not_lost(number, tmp_path):
+    run = Run(tmp_path / "log", drop_in_a_callback, number)
+    assert (run.wait(), run.text()) == (128 + number, "stopped\n")
 
 
 @pytest.fixture(autouse=True)

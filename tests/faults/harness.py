@@ -8,6 +8,7 @@ import hashlib
 import json
 import multiprocessing
 import os
+import runpy
 import signal
 import sys
 import time
@@ -15,6 +16,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
+from multiprocessing import forkserver
 from pathlib import Path
 
 import cv2
@@ -22,9 +24,16 @@ import numpy as np
 import torch
 from omegaconf import OmegaConf
 
+import src
+from src.app.stop_signals import TERMINATING
+
 FORKS = multiprocessing.get_context("forkserver")
 PRELOADED = ("src.train", "src.eval", "src.reconstruct", "baselines.highpass")
-FORKS.set_forkserver_preload([*PRELOADED, "tests.faults.test_damaged_files"])
+LATE = (  # what a run would import or load, each time anew, once it is under way
+    "src.sim.scenes.photographs", "src.sim.turbulence.simulated", "src.training.checkpoint_io",
+    "src.training.interruption", "tests.faults.loaded_kernels",
+)  # fmt: skip
+FORKS.set_forkserver_preload([*PRELOADED, *LATE, "tests.faults.test_damaged_files"])
 MAX_RUN_S = 600.0  # a run that takes longer hangs, also on a machine at work
 
 
@@ -53,7 +62,9 @@ class Run:
         self.log = log
         log.parent.mkdir(parents=True, exist_ok=True)
         log.write_text("")
-        self.process = FORKS.Process(target=_work, args=(str(log), work, arguments))
+        forkserver.ensure_running()
+        server = forkserver._forkserver._forkserver_address
+        self.process = FORKS.Process(target=_work, args=(str(log), server, work, arguments))
         self.process.start()
 
     def wait(self, seconds: float = MAX_RUN_S) -> int:
@@ -90,12 +101,17 @@ def leave_slices_out(_rows: object, path: Path, **_: object) -> None:
     path.write_bytes(cv2.imencode(".png", np.zeros((1, 1), np.uint8))[1].tobytes())
 
 
-def _work(log: str, work: Callable, arguments: tuple) -> None:
+def _work(log: str, server: str, work: Callable, arguments: tuple) -> None:
+    # Those that the run forks come from the same server, not from one that imports all anew.
+    forkserver._forkserver._forkserver_address = server
+    forkserver._forkserver.ensure_running = int
     file = os.open(log, os.O_WRONLY | os.O_APPEND)
     for number, name in ((1, "stdout"), (2, "stderr")):
         os.dup2(file, number)
         setattr(sys, name, os.fdopen(number, "w", buffering=1))
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    for number in TERMINATING:
+        signal.signal(number, signal.SIG_DFL)  # not ignored as under nohup
     multiprocessing.set_start_method("fork", force=True)  # for loaders' workers, as of a run
     torch.set_num_threads(1)
     from src.app import entry_point
@@ -109,6 +125,12 @@ def run_entry_point(name: str, config: str) -> None:
     """Run src.train, src.eval or src.reconstruct on a resolved config (YAML)."""
     function = "evaluate" if name == "eval" else name
     getattr(import_module(f"src.{name}"), function)(OmegaConf.create(config))
+
+
+def run_program(name: str, *words: str) -> None:
+    """Run `python -m src.<name>` with the words of a command line."""
+    sys.argv = [name, *words]
+    runpy.run_path(str(Path(src.__file__).with_name(f"{name}.py")), run_name="__main__")
 
 
 def outcome(run: Path) -> dict:
