@@ -197,8 +197,9 @@ def train_at_terminal(name: str, *words: str) -> None:
     terminal = os.open(name, os.O_RDWR)  # which is now that of the session
     for number in range(3):
         os.dup2(terminal, number)
-    streams = {number: os.fdopen(number, "w", buffering=1) for number in (1, 2)}
-    sys.stdout, sys.stderr = streams.values()
+    sys.stdout, sys.stderr = (
+        os.fdopen(number, "w", buffering=1, closefd=False) for number in (1, 2)
+    )
     warnings.simplefilter("ignore")
     run_program("train", *words)
 
@@ -208,8 +209,9 @@ def test_ctrl_c_at_a_terminal_ends_in_one_line(tmp_path):
     terminal, of_child = pty.openpty()
     run = Run(tmp_path / "log", train_at_terminal, os.ttyname(of_child), *words)
     try:
-        before = read_until(terminal, b" of 5000 loss", 400)
-        os.close(of_child)
+        before = read_until(terminal, b"\n", 400)
+        os.close(of_child)  # now the run alone holds it, so that the terminal closes with it
+        before += read_until(terminal, b" of 5000 loss", 400)
         os.write(terminal, b"\x03")
         after = read_until(terminal, b"never", 100).decode()
         code = run.wait(100)

@@ -108,7 +108,7 @@ def _work(log: str, server: str, work: Callable, arguments: tuple) -> None:
     file = os.open(log, os.O_WRONLY | os.O_APPEND)
     for number, name in ((1, "stdout"), (2, "stderr")):
         os.dup2(file, number)
-        setattr(sys, name, os.fdopen(number, "w", buffering=1))
+        setattr(sys, name, os.fdopen(number, "w", buffering=1, closefd=False))
     signal.signal(signal.SIGINT, signal.default_int_handler)
     for number in TERMINATING:
         signal.signal(number, signal.SIG_DFL)  # not ignored as under nohup
