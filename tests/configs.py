@@ -1,9 +1,10 @@
-"""Configs are composed at every turn of the tests: Hydra reads a file once, until it is changed, and
-puts the same files of conf/ together once for the same overrides.
+"""Configs are composed at every turn of the tests: Hydra reads a file once, until it is changed,
+and puts the same files of conf/ together once for the same overrides.
 """
 
 import os
 import pickle
+import re
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ from hydra._internal import config_loader_impl
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra._internal.config_repository import ConfigRepository
 from hydra.core.object_type import ObjectType
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.utils import JobRuntime
 from hydra.plugins.config_source import ConfigResult
 from omegaconf import DictConfig
@@ -39,20 +41,26 @@ class RememberingRepository(ConfigRepository):
         return pickle.loads(_read[key])
 
 
-def compose_once(self, config_name, overrides, run_mode, *others, **named) -> DictConfig:
+def compose_once(
+    self, config_name, overrides, run_mode, from_shell=True, validate_sweep_overrides=True
+) -> DictConfig:
     """Return a config of conf/ that was composed before in the same folder, or compose it."""
+    given = config_name, overrides, run_mode
     places = [place.path for place in self.config_search_path.get_path()]
     files = [place for place in places if "://" not in place or place.startswith("file://")]
     own = all(Path(place.removeprefix("file://")) == CONF for place in files)
-    if not own or any("hydra.searchpath" in override for override in overrides):
-        return _compose(self, config_name, overrides, run_mode, *others, **named)
-    where = tuple(places), os.getcwd(), JobRuntime.instance().get("name")
-    how = run_mode, *others, *sorted(named.items())
-    key = where, config_name, tuple(overrides), how
+    if not own or any(re.search(r"hydra\.(searchpath|job)", override) for override in overrides):
+        return _compose(self, *given, from_shell, validate_sweep_overrides)
+    key = *places, os.getcwd(), config_name, *overrides, run_mode
     if key not in _composed:
-        cfg = _compose(self, config_name, overrides, run_mode, *others, **named)
+        cfg = _compose(self, *given, from_shell, validate_sweep_overrides)
         _composed[key] = pickle.dumps(cfg)
-    return pickle.loads(_composed[key])
+    elif validate_sweep_overrides:
+        parsed = OverridesParser.create().parse_overrides(overrides)
+        self.validate_sweep_overrides_legal(parsed, run_mode, from_shell)
+    cfg = pickle.loads(_composed[key])
+    cfg.hydra.job.name = JobRuntime.instance().get("name")
+    return cfg
 
 
 def remember_configs(patched: pytest.MonkeyPatch) -> None:
