@@ -11,6 +11,7 @@ import torch
 from hydra.core.hydra_config import HydraConfig
 
 import src  # noqa: F401 - sets OpenCV's limits before a test imports it
+from tests.configs import remember_configs
 from tests.faults.harness import leave_slices_out
 from tests.typecheck import check_annotations
 
@@ -42,6 +43,14 @@ def default_dtype(dtype: torch.dtype) -> Iterator[None]:
 
 jaxtyping.jaxtyped = check_annotations  # what the hook decorates everything with
 jaxtyping.install_import_hook(checked_modules(), "tests.typecheck.check")
+
+
+@pytest.fixture(autouse=True, scope="session")
+def configs_are_composed_once():
+    """Also where a test, a fixture or what is tested does it again."""
+    with pytest.MonkeyPatch.context() as patched:
+        remember_configs(patched)
+        yield
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -25,8 +25,8 @@ TINY = ["debug=fdr", "~callbacks.progress", "loss=l1", "metrics.lpips=null"]
 
 def config(name: str, run: Path, *overrides: str) -> DictConfig:
     with initialize_config_dir(str(ROOT / "conf"), version_base=None):
-        cfg = compose(name, [*overrides, f"paths.out={run}"])
-    cfg.paths.run = str(run)
+        cfg = compose(name, list(overrides))
+    cfg.paths.out = cfg.paths.run = str(run)
     return cfg
 
 
