@@ -97,18 +97,22 @@ def compute_fitted_psfs(psfs: FittedPSFs, phase: torch.Tensor, d_over_r0: float)
 def exact_psfs_of_all_modes(
     coefficients: torch.Tensor, turbulence: Turbulence, size: int
 ) -> torch.Tensor:
-    """Return exact PSFs (*n, size, size) of Noll 2..modes + 1, blurred by those beyond 120."""
+    """Return exact PSFs (*n, size, size) of Noll 2..modes + 1, blurred by those beyond 120.
+
+    The blur is symmetric: that of a pixel's area gives what the pixel collects of any PSF.
+    """
     fine, fidelity = 79, turbulence.fidelity
     step = SAMPLES_PER_LAMBDA_OVER_D / fidelity.lambda_over_d_px
     grid, psfs = pixel_integration_matrix(size, fine, step).float(), []
     beyond = unresolved_structure_function() * fidelity.d_over_r0 ** (5 / 3)
+    areas = torch.einsum("iy,jx->ijyx", grid, grid).flatten(0, 1)
+    collected = blur_by_phase(areas, beyond, fine).flatten(1).T
     for part in coefficients.flatten(0, -2).split(1000):
         stored = fraunhofer_psf(
             part, lambda_over_d_px=SAMPLES_PER_LAMBDA_OVER_D, size=fine, pupil=fine - 3, points=1,
             normalise_plane=True,
         )  # fmt: skip
-        blurred = blur_by_phase(stored, beyond, fine)
-        psfs.append(grid @ blurred @ grid.T)
+        psfs.append(stored.flatten(1) @ collected)
     return torch.cat(psfs).reshape(*coefficients.shape[:-1], size, size)
 
 
