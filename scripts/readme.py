@@ -52,7 +52,7 @@ ROWS = {  # what it is: a network in weights/, how many of the nine views it is 
     PAPER: ("lf3x3", 9),
     SINGLE: ("setnet_medium", 1),
     ONE_VIEW: ("single256", 1),
-    "one view, E2VID+, no turbulence, 0.24 h": ("clean/e2vid_plus", 1),
+    "one view, E2VID+, no turbulence, 1.1 h": ("clean/e2vid_plus", 1),
 }
 BASELINES = {  # their files in the folder of published weights
     "firenet_plus": ["FireNet+/firenet_plus_state_dict.pth"],
