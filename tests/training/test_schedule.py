@@ -57,6 +57,9 @@ RECIPE = [
 ]
 RECIPE += ["callbacks.learning_curve.interval_h=3", "trainer.max_steps=-1", "scheduler=null"]
 RECIPE += ["trainer.limit_val_batches=0", "augment.noise_std=0.1", "channels_last=true"]
+# What is tested besides costs more than the training.
+RECIPE += ["experiment=single256", "reference_baseline=null"]
+RECIPE += ["data.test_windows=2", "data.unscored_windows=0"]
 
 
 def run(folder: Path, *overrides: str) -> dict:
