@@ -1,12 +1,14 @@
 """From a config to objects: classes of one's own, optics as the network wants them, the trainer."""
 
 import platform
-import subprocess
+import resource
 import sys
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import torch
 from lightning.pytorch.callbacks import ProgressBar
 from omegaconf import OmegaConf
 
@@ -18,6 +20,7 @@ from src.models import files
 from src.recordings.files import event_file, event_writers, recording_inputs
 from src.train import train
 from tests.conftest import ROOT
+from tests.faults.harness import Run
 from tests.test_train import TINY, config
 
 OWN = """
@@ -253,28 +256,25 @@ def test_a_clip_read_backwards_first_is_scored(tmp_path):
     assert ratio == pytest.approx(1.5)  # two of four windows are read twice
 
 
-KEEPING = """
-import resource, torch
-from omegaconf import OmegaConf
-from src.app import build, hardware  # with all that a training has loaded
-
-def faults():
+def page_faults() -> int:
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-    torch.ones(64, 1024, 1024)
+    torch.ones(16, 1024, 1024)
     return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
 
-torch.set_num_threads(1)
-given_back = [faults() for _ in range(3)][-1]
-hardware.retain_freed_memory(OmegaConf.create({"trainer": {"accelerator": "cpu"}}))
-kept = [faults() for _ in range(3)][-1]
-print(given_back, kept)
-"""
+
+def count_page_faults(told: Path) -> None:
+    """Write to `told` the page faults before and after memory is kept."""
+    given_back = [page_faults() for _ in range(3)][-1]
+    hardware.retain_freed_memory(OmegaConf.create({"trainer": {"accelerator": "cpu"}}))
+    kept = [page_faults() for _ in range(3)][-1]
+    told.write_text(f"{given_back} {kept}")
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="memory is kept by glibc only")
-def test_a_training_on_a_cpu_keeps_the_memory_it_frees():
-    ran = subprocess.run([sys.executable, "-c", KEEPING], cwd=ROOT, capture_output=True, text=True)
-    given_back, kept = map(int, ran.stdout.split())
+def test_a_training_on_a_cpu_keeps_the_memory_it_frees(tmp_path):
+    """In a process of its own, with all that a training has loaded."""
+    assert Run(tmp_path / "log", count_page_faults, tmp_path / "told").wait() == 0
+    given_back, kept = map(int, (tmp_path / "told").read_text().split())
     assert kept < 0.01 * given_back
 
 

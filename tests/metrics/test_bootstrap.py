@@ -37,7 +37,7 @@ def test_of_few_seeds_it_is_student_s_interval():
     assert low == pytest.approx(1 - half, rel=0.1) and high == pytest.approx(1 + half, rel=0.1)
 
 
-@pytest.mark.parametrize("clips", [2, 3, 4, 6, 9, 12, 19, 27])
+@pytest.mark.parametrize("clips", [2, 4, 9, 27])
 def test_how_often_it_holds_the_mean_is_what_is_computed(clips):
     rng, held = np.random.default_rng(1), 0
     for _ in range(1000):

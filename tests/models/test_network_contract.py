@@ -9,6 +9,8 @@ import torch
 from torch import nn
 from torch.nn.functional import avg_pool2d
 
+from baselines.cista import CISTA
+from baselines.firenet import FireNet
 from src.models.network import unroll
 from tests.baselines import test_networks
 from tests.models import test_e2vid, test_setnet
@@ -41,13 +43,14 @@ class Subject(NamedTuple):
 
 
 def frozen(kind: type) -> Subject:
-    make, by_heart = partial(test_networks.small, kind), ByHeart((1, 3, 9, 16), 5e-3, 60, 0.5)
+    steps = 40 if kind in (FireNet, CISTA) else 20
+    make, by_heart = partial(test_networks.small, kind), ByHeart((1, 3, 9, 16), 5e-3, steps, 0.5)
     return Subject(make, (1, 3, 9, 24), 1, {}, 3, by_heart)
 
 
 def e2vid(recurrent: str) -> Subject:
     make = partial(test_e2vid.small, recurrent=recurrent)
-    close, by_heart = {"atol": 1e-6, "rtol": 1e-5}, ByHeart((2, 4, 2, 16), 3e-3, 80, 0.25)
+    close, by_heart = {"atol": 1e-6, "rtol": 1e-5}, ByHeart((2, 4, 2, 16), 3e-3, 30, 0.25)
     return Subject(make, (2, 4, 2, 16), 1, close, 4, by_heart, {"base_channels": 8})
 
 
@@ -55,7 +58,7 @@ SUBJECTS = {kind.__name__: frozen(kind) for kind in test_networks.PUBLISHED} | {
     "E2VID": e2vid("convlstm"),
     "E2VID of ConvGRU": e2vid("convgru"),
     "SetNet": Subject(
-        test_setnet.small, (1, 4, 9, 16), 2, {}, 6, ByHeart((2, 4, 2, 16), 1e-2, 100, 0.25)
+        test_setnet.small, (1, 4, 9, 16), 2, {}, 6, ByHeart((2, 4, 2, 16), 1e-2, 60, 0.25)
     ),
 }
 all_subjects = pytest.mark.parametrize("subject", SUBJECTS.values(), ids=SUBJECTS)

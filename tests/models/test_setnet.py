@@ -123,13 +123,11 @@ def test_positions_matter():
 
 @torch.no_grad()
 def test_state_stays_bounded_over_500_windows_of_noise():
-    network, state = small(), None
-    for step in range(500):
-        noise = torch.randn(1, 2, 3, 16, 16, generator=torch.Generator().manual_seed(step))
-        frame, state = network(30 * noise + 10, state)
+    noise = torch.randn(1, 500, 2, 3, 16, 16, generator=torch.Generator().manual_seed(0))
+    frames, state = unroll(small(), 30 * noise + 10)
     bounded = state.activity, state.context_recency, state.update_recency, state.hidden
     assert max(float(part.abs().max()) for part in bounded) <= 1
-    assert all(torch.isfinite(part).all() for part in (frame, *pytree.tree_leaves(state)))
+    assert all(torch.isfinite(part).all() for part in (frames, *pytree.tree_leaves(state)))
     assert float(state.evidence.min()) > 1  # it only grows, where everything is revealed
     # A leaky sum is at most what comes in a window divided by what leaks out of it.
     assert float(state.view_sums.abs().max()) < 4 * 3 * (10 + 30 * 6) / (1 - 0.984)
@@ -139,14 +137,13 @@ def test_state_stays_bounded_over_500_windows_of_noise():
 def test_empty_windows_hold_the_picture():
     network = small()
     _, state = unroll(network, voxels())
-    nothing, frames = torch.zeros(1, 9, 3, 16, 16), []
-    for _ in range(200):
-        frame, state = network(nothing, before := state)
-        frames.append(frame)
+    nothing = torch.zeros(1, 200, 9, 3, 16, 16)
+    frames, before = unroll(network, nothing[:, 1:], state)
+    last, state = network(nothing[:, 0], before)
     for was, now in zip(pytree.tree_leaves(before), pytree.tree_leaves(state), strict=True):
         assert torch.equal(was, now)
-    assert float((frames[60] - frames[-1]).abs().max()) < 1e-3
-    assert float(frames[-1].std()) > 1e-3
+    assert float((frames[:, 60] - last).abs().max()) < 1e-3
+    assert float(last.std()) > 1e-3
 
 
 @torch.no_grad()
@@ -305,12 +302,10 @@ def test_events_count_per_time_not_per_window():
 @pytest.mark.parametrize("events", [voxels(1, 2, 2, 64), events_within(*BLOCK, 2)])
 @torch.no_grad()
 def test_an_empty_window_cut_in_pieces_passes_the_same_time(events, pieces):
-    network, nothing = small(), torch.zeros(1, 2, 3, 64, 64)
+    network, nothing = small(), torch.zeros(1, pieces, 2, 3, 64, 64)
     _, before = unroll(network, events)
-    _, whole = network(nothing, before, window_s=0.1)
-    cut = before
-    for _ in range(pieces):
-        _, cut = network(nothing, cut, window_s=0.1 / pieces)
+    _, whole = network(nothing[:, 0], before, window_s=0.1)
+    _, cut = unroll(network, nothing, before, window_s=0.1 / pieces)
     names = "view_sums", "event_trace", "activity", "context_recency"
     for name in names if float(before.activity.mean()) < 1 else names[:3]:
         one, other = getattr(whole, name), getattr(cut, name)

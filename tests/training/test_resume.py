@@ -11,9 +11,10 @@ from torch.optim.lr_scheduler import CosineAnnealingLR
 
 from src.train import train
 from src.training.resume import apply_config_to_optimizer_state, check_max_steps
-from tests.test_train import TINY, config
+from tests.test_train import TINY, UNDRAWN, config
 
 STEPS = 4
+RECIPE = [*TINY, *UNDRAWN, "experiment=single256"]
 
 
 def network() -> nn.Linear:
@@ -101,23 +102,23 @@ def begun(tmp_path_factory):
     """The folder of two trainings of two steps, with a scheduler and by time."""
     folder = tmp_path_factory.mktemp("begun")
     for name, words in (("steps", []), ("hours", HOURS)):
-        train(config("train", folder / name, *TINY, *words, "trainer.max_steps=2"))
+        train(config("train", folder / name, *RECIPE, *words, "trainer.max_steps=2"))
     return folder
 
 
 @pytest.mark.parametrize(("before", "after", "rate", "schedules"), GOING_ON)
 def test_a_run_that_goes_on_obeys_its_config(before, after, rate, schedules, begun, tmp_path):
     more = [*after, "optimizer.lr=0.1", "trainer.max_steps=3", f"ckpt={begun / before}"]
-    train(config("train", tmp_path, *TINY, *more))
+    train(config("train", tmp_path, *RECIPE, *more))
     found = rates(tmp_path)
     assert found[0] == pytest.approx(rate, rel=1e-4) and found[1] == schedules
 
 
 def test_without_averaging_a_run_goes_on_from_the_weights_in_training(tmp_path):
     steps = ["trainer.max_steps=2", "optimizer.lr=0.01"]
-    train(config("train", tmp_path / "a", *TINY, *steps, "ema_decay=0.9"))
+    train(config("train", tmp_path / "a", *RECIPE, *steps, "ema_decay=0.9"))
     plain = ["ema_decay=null", f"ckpt={tmp_path / 'a'}"]
-    train(config("train", tmp_path / "b", *TINY, *steps, *plain))
+    train(config("train", tmp_path / "b", *RECIPE, *steps, *plain))
     before, after = (
         torch.load(tmp_path / run / "checkpoints" / "last.ckpt", weights_only=True) for run in "ab"
     )

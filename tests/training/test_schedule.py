@@ -21,7 +21,7 @@ from src.training.ema import WeightEMA
 from src.training.learning_curve import LearningCurve
 from src.training.reconstructor import Reconstructor
 from src.training.schedule import CosineSchedule, TrainingClock
-from tests.test_train import TINY, config
+from tests.test_train import TINY, UNDRAWN, config
 
 HOUR = 3600.0  # by the clock below every step is one hour
 
@@ -57,6 +57,7 @@ RECIPE = [
 ]
 RECIPE += ["callbacks.learning_curve.interval_h=3", "trainer.max_steps=-1", "scheduler=null"]
 RECIPE += ["trainer.limit_val_batches=0", "augment.noise_std=0.1", "channels_last=true"]
+RECIPE += ["experiment=single256", *UNDRAWN]
 
 
 def run(folder: Path, *overrides: str) -> dict:
