@@ -124,7 +124,7 @@ def test_views_of_another_sensor_than_the_recordings_are_refused(tmp_path):
     scenes.views().save(tmp_path / "views.yaml")
     events = scenes.events(0.02)[:200]
     columns = {name: events[name] for name in "tp"} | dict.fromkeys("xy", np.arange(200) % 40)
-    given = ["ckpt=setnet_small", f"views={tmp_path}/views.yaml", f"recording={tmp_path}/a.npz"]
+    given = ["baseline=highpass", f"views={tmp_path}/views.yaml", f"recording={tmp_path}/a.npz"]
     columns["time_unit"] = "us"
     np.savez(tmp_path / "a.npz", **columns, size=[64, 48])
     with pytest.raises(ValueError, match=r"sensor must be .* \(48, 64\), got \(360, 640\)"):

@@ -4,8 +4,6 @@ import json
 import os
 import signal
 import socket
-import subprocess
-import sys
 import time
 from pathlib import Path
 from urllib.error import HTTPError
@@ -15,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.conftest import ROOT
+from tests.faults.harness import Run, run_program
 from tests.live_view import browser, scenes
 from tests.live_view.browser import until
 
@@ -40,12 +38,7 @@ class Server:
             "fps=30",
             "threads=1",
         ]
-        self.log = open(folder / "log", "w+")  # noqa: SIM115 - closed with the process
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "src.live", *overrides], cwd=ROOT,
-            stdout=self.log, stderr=subprocess.STDOUT,
-            env={**os.environ, "OMP_NUM_THREADS": "1"},
-        )  # fmt: skip
+        self.run = Run(folder / "log", run_program, "live", *overrides)
         self.address = f"http://127.0.0.1:{self.port}"
 
     def until_up(self) -> None:
@@ -55,13 +48,9 @@ class Server:
             try:
                 return self.status()
             except OSError:
-                assert self.process.poll() is None and time.monotonic() < end, self.text()
+                is_there = self.run.process.exitcode is None
+                assert is_there and time.monotonic() < end, self.run.text()
                 time.sleep(0.1)
-
-    def text(self) -> str:
-        """Return what was printed."""
-        self.log.flush()
-        return Path(self.log.name).read_text()
 
     def status(self) -> dict:
         """Return what /status answers."""
@@ -70,10 +59,8 @@ class Server:
 
     def close(self) -> None:
         """End it, however."""
-        if self.process.poll() is None:
-            self.process.kill()
-        self.process.wait()
-        self.log.close()
+        self.run.process.kill()
+        self.run.process.join()
 
 
 @pytest.fixture(scope="module")
@@ -216,10 +203,10 @@ def test_on_a_phone_nothing_is_cut_and_a_finger_hits_every_control(server):
 
 
 def test_ctrl_c_leaves_no_process_and_no_port(server):
-    assert "this machine only" in server.text()
-    server.process.send_signal(signal.SIGINT)
-    assert server.process.wait(60) == 0, server.text()
-    assert "Traceback" not in server.text()
+    assert "this machine only" in server.run.text()
+    os.kill(server.run.process.pid, signal.SIGINT)
+    assert server.run.wait(60) == 0, server.run.text()
+    assert "Traceback" not in server.run.text()
     for port, kind in ((server.port, socket.SOCK_STREAM), (server.events, socket.SOCK_DGRAM)):
         with socket.socket(socket.AF_INET, kind) as again:
             again.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

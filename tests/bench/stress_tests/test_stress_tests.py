@@ -376,12 +376,13 @@ def test_a_lamp_makes_events_on_a_scene_that_stands_still(bench):
     assert 0.3 < signs.mean() < 0.7 and torch.equal(plain.target, flickering.target)
 
 
-def test_every_stress_test_runs_on_a_set_network(bench):
+def test_every_stress_test_runs_on_a_set_network():
     torch.manual_seed(0)
+    bench = StressBench(pipeline(windows=8), [0], warmup=2)
     subject = Candidate("setnet", SetNet(channels=4).eval(), 9)
     tests = {
         recurrence.measure_contrast_retention_percent: {"windows": [3], "limit_percent": 1.0},
-        recurrence.measure_long_sequence_drift: {"windows": 96, "limit_db": 1.0},
+        recurrence.measure_long_sequence_drift: {"windows": 48, "limit_db": 1.0},
         recurrence.measure_convergence_windows: {"limit_windows": 1.0},
         recurrence.measure_flicker_recovery: {"limit_windows": 1.0},
         recurrence.measure_static_scene_jitter_percent: {"limit_percent": 1.0},
@@ -390,7 +391,7 @@ def test_every_stress_test_runs_on_a_set_network(bench):
         recurrence.measure_bf16_psnr_difference: {"windows": 8, "limit_db": 1.0},
         conditions.measure_window_rate_loss: {
             "rates_hz": [1200],
-            "duration_s": 0.1,
+            "duration_s": 0.05,
             "limit_db": 1.0,
         },
         conditions.measure_voxel_dropout_loss: {"kept_shares": [0.1], "limit_db": 1.0},
