@@ -1,17 +1,21 @@
 """docs/extend.md is followed to the letter in a copy of the repository: its files, its commands."""
 
+import importlib
 import json
 import os
 import re
+import runpy
 import shutil
-import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tests.configs import remember_configs
 from tests.conftest import ROOT
+from tests.faults.harness import Run, leave_slices_out
 
 SMALL = ["scene.height=64", "scene.width=64", "data.test_windows=4", "data.test_crop=32"]
 SCORED = [
@@ -33,16 +37,6 @@ OWN_KEYS = {  # of classes of one's own, with names that keys of this repository
     "scene=snow": ["++scene.speed=1"],
 }
 STEP = re.compile(r"(New|In) `([^`]+)`(?:, below `([^`]+)`)?:\n\n```\w+\n(.*?)```", re.S)
-DRIVER = """
-import json, runpy, sys
-for line in json.load(open("commands.json")):
-    sys.argv = [line[2], *line[3:]]
-    try:
-        runpy.run_module(line[2], run_name="__main__", alter_sys=True)
-    except SystemExit as end:
-        if end.code:
-            sys.exit(f"{line}: {end.code}")
-"""
 
 
 @pytest.fixture(scope="module")
@@ -86,13 +80,31 @@ def commands(page: str) -> list[list[str]]:
     ]
 
 
+def follow(copy: Path, lines: list[list[str]]) -> None:
+    """Run commands with the modules of the copy, in a process that has those of this repository."""
+    left = [name for name in sys.modules if name.split(".")[0] in ("src", "baselines")]
+    for name in left:
+        del sys.modules[name]
+    sys.meta_path[:] = [finder for finder in sys.meta_path if "jaxtyping" not in str(finder)]
+    sys.path.insert(0, str(copy))
+    os.chdir(copy)
+    warnings.simplefilter("ignore")
+    remember_configs(pytest.MonkeyPatch())
+    samples = importlib.import_module("src.figures.samples")
+    assert Path(samples.__file__).is_relative_to(copy)
+    samples.draw_comparison = leave_slices_out
+    for line in lines:
+        sys.argv = [line[2], *line[3:]]
+        try:
+            runpy.run_module(line[2], run_name="__main__", alter_sys=True)
+        except SystemExit as end:
+            if end.code:
+                sys.exit(f"{line}: {end.code}")
+
+
 def test_the_page_is_followed(copy, page):
-    (copy / "commands.json").write_text(json.dumps(commands(page)))
-    (copy / "driver.py").write_text(DRIVER)
-    environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(copy)}
-    run = [sys.executable, "-W", "ignore", "driver.py"]
-    done = subprocess.run(run, cwd=copy, env=environment, capture_output=True, text=True)
-    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
+    run = Run(copy / "log.txt", follow, copy, commands(page))
+    assert run.wait() == 0, run.text()[-4000:]
     scored = json.loads((copy / "out" / "contrast" / "results.json").read_text())
     assert scored["test"]["contrast"]["mean"] > 0 and scored["own_metrics"] == {"contrast": 0}
     assert "contrast" in (copy / "out" / "contrast" / "clips.csv").read_text().split("\n")[0]

@@ -2,6 +2,7 @@
 
 import ast
 from collections import Counter
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -22,6 +23,7 @@ def place(module: str) -> int:
     return ORDER.index(max(fitting, key=len)) if fitting else len(ORDER)
 
 
+@cache
 def imports(file: Path) -> set[str]:
     """The modules of this repository that a file imports, wherever in it."""
     found = set()

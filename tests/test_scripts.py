@@ -25,12 +25,16 @@ from src.metrics.table import METRICS
 from src.models import files
 from src.models.network import unroll
 from src.models.setnet import SetNet
+from src.recordings.files.event_writers import write_events
+from src.recordings.files.recording import read_events
 from src.records import results
 from src.records.runs import Run
 from src.train import train
 from src.training import learning_curve
 from tests.conftest import ROOT
 from tests.test_train import TINY, config
+
+ALONE = [*TINY, "reference_baseline=null"]
 
 
 @pytest.fixture
@@ -41,9 +45,8 @@ def clean(monkeypatch):
 
 def test_a_trained_run_is_shipped_whole_with_its_card(tmp_path, monkeypatch, clean):
     run, weights = tmp_path / "run", tmp_path / "weights"
-    train(
-        config("train", run, *TINY, "trainer.max_steps=2", "callbacks.learning_curve.interval_h=1")
-    )
+    two_steps = ["trainer.max_steps=2", "callbacks.learning_curve.interval_h=1"]
+    train(config("train", run, *ALONE, *two_steps))
     monkeypatch.setattr(files, "WEIGHTS", weights)
     path = ship(run, "tiny/one", [run])
     shipped, trained = files.load("tiny/one"), files.load(files.newest_checkpoint(run))
@@ -56,7 +59,7 @@ def test_a_trained_run_is_shipped_whole_with_its_card(tmp_path, monkeypatch, cle
         learning_curve.TRAINING_STATE not in card
         and learning_curve.read_training_progress(path)["steps"] == 2
     )
-    train(config("train", tmp_path / "on", *TINY, "trainer.max_steps=1", f"ckpt={path}"))
+    train(config("train", tmp_path / "on", *ALONE, "trainer.max_steps=1", f"ckpt={path}"))
     assert (
         files.newest_checkpoint(tmp_path / "on")
         and torch.load(files.newest_checkpoint(tmp_path / "on"))["steps"] == 3
@@ -106,7 +109,7 @@ def refuse_what_is_there(run, path, monkeypatch):
 
 def test_weights_of_a_stage_are_shipped_with_the_card_of_a_run(tmp_path, monkeypatch, clean):
     run = tmp_path / "one"
-    train(config("train", run, *TINY, "trainer.max_steps=1"))
+    train(config("train", run, *ALONE, "trainer.max_steps=1"))
     first = ship(run, "one", [], Given(folder=tmp_path))
     doubled = files.load(first)
     for parameter in doubled.parameters():
@@ -379,8 +382,10 @@ def test_a_camera_frame_is_found_in_a_list_with_comments_and_names_with_spaces(t
         gallery.camera(recording, 0)
 
 
-def test_a_gallery_has_a_row_for_each_recording_and_a_column_for_each_network():
-    recording = str(ROOT / "docs" / "example" / "cat.raw")
+def test_a_gallery_has_a_row_for_each_recording_and_a_column_for_each_network(tmp_path):
+    recording = str(tmp_path / "cat.raw")
+    events = read_events(ROOT / "docs" / "example" / "cat.raw")
+    write_events(tmp_path / "cat.raw", events[:10_000], width=512, height=384)
     figure = gallery.gallery([recording, recording], ["setnet_small", "highpass"], None)
     assert [panel.get_title() for panel in figure.axes] == ["setnet_small", "highpass", "", ""]
     assert [panel.get_ylabel() for panel in figure.axes] == ["cat", "", "cat", ""]

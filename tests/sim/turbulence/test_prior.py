@@ -10,7 +10,7 @@ from omegaconf import OmegaConf
 
 from src.app.compose import compose_config
 from src.sim.noise import generator
-from src.sim.turbulence import prior_trial, sample_atmosphere
+from src.sim.turbulence import Atmosphere, prior_trial, sample_atmosphere
 from src.sim.turbulence.prior import (
     TILT_AND_BLUR_PX,
     NoCameraError,
@@ -47,9 +47,14 @@ def test_extreme_turbulence_needs_more_than_weak_scintillation():
         assert 6.9 <= path.tilt_correlation_half_length_px(256) <= 15.1
 
 
-def test_half_lengths_are_log_uniform_and_some_of_whole_views():
-    paths = [sample_atmosphere("mixed", generator(seed)) for seed in range(600)]
-    lengths = np.array([path.tilt_correlation_half_length_px(256) for path in paths])
+@pytest.fixture(scope="module")
+def mixed() -> list[Atmosphere]:
+    """Six hundred atmospheres of the mix."""
+    return [sample_atmosphere("mixed", generator(seed)) for seed in range(600)]
+
+
+def test_half_lengths_are_log_uniform_and_some_of_whole_views(mixed):
+    lengths = np.array([path.tilt_correlation_half_length_px(256) for path in mixed])
     rigid = (lengths > 100).mean()
     assert rigid == pytest.approx(0.15, abs=4 * math.sqrt(0.15 * 0.85 / 600) + 0.02)
     local = np.log(lengths[lengths < 100] / 5) / math.log(20)
@@ -57,8 +62,8 @@ def test_half_lengths_are_log_uniform_and_some_of_whole_views():
     assert 0.4 < middle < 0.65
 
 
-def test_mixed_is_the_papers_mix():
-    drawn = Counter(sample_atmosphere("mixed", generator(seed)).severity for seed in range(600))
+def test_mixed_is_the_papers_mix(mixed):
+    drawn = Counter(path.severity for path in mixed)
     for name, expected in {"weak": 0.1, "medium": 0.3, "strong": 0.6}.items():
         error = 4 * math.sqrt(expected * (1 - expected) / 600)
         assert drawn[name] / 600 == pytest.approx(expected, abs=error)
