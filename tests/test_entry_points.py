@@ -84,7 +84,7 @@ def test_a_program_that_uses_the_package_keeps_its_own_errors(program):
 
 def test_a_wrong_value_is_one_line_and_exit_code_2_of_the_process(tmp_path):
     words = [*TINY, "data.crop=1000", f"paths.out={tmp_path}"]
-    run = Run(tmp_path / "log", run_program, "train", *words)
+    run = Run(tmp_path / "log", run_program, "train", *words, program=True)
     assert run.wait() == 2, run.text()
     (line,) = [line for line in run.text().splitlines() if line.startswith("error: ")]
     assert "data.crop must be in 8..72" in line and "Traceback" not in run.text()

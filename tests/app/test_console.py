@@ -207,7 +207,7 @@ def train_at_terminal(name: str, *words: str) -> None:
 def test_ctrl_c_at_a_terminal_ends_in_one_line(tmp_path):
     words = [*SMALL, f"hydra.run.dir={tmp_path}"]
     terminal, of_child = pty.openpty()
-    run = Run(tmp_path / "log", train_at_terminal, os.ttyname(of_child), *words)
+    run = Run(tmp_path / "log", train_at_terminal, os.ttyname(of_child), *words, program=True)
     try:
         before = read_until(terminal, b"\n", 400)
         os.close(of_child)  # now the run alone holds it, so that the terminal closes with it

@@ -56,15 +56,19 @@ class Tally:
 
 
 class Run:
-    """`work(*arguments)` in a process of its own, as an entry point runs it; output in `log`."""
+    """`work(*arguments)` in a process of its own, output in `log`; as an entry point runs it, or
+    where it is a `program` as it stands: what ends that in one line is its own.
+    """
 
-    def __init__(self, log: Path, work: Callable, *arguments):
+    def __init__(self, log: Path, work: Callable, *arguments, program: bool = False):
         self.log = log
         log.parent.mkdir(parents=True, exist_ok=True)
         log.write_text("")
         forkserver.ensure_running()
         server = forkserver._forkserver._forkserver_address
-        self.process = FORKS.Process(target=_work, args=(str(log), server, work, arguments))
+        self.process = FORKS.Process(
+            target=_work, args=(str(log), server, program, work, arguments)
+        )
         self.process.start()
 
     def wait(self, seconds: float = MAX_RUN_S) -> int:
@@ -101,7 +105,7 @@ def leave_slices_out(_rows: object, path: Path, **_: object) -> None:
     path.write_bytes(cv2.imencode(".png", np.zeros((1, 1), np.uint8))[1].tobytes())
 
 
-def _work(log: str, server: str, work: Callable, arguments: tuple) -> None:
+def _work(log: str, server: str, program: bool, work: Callable, arguments: tuple) -> None:
     # Those that the run forks come from the same server, not from one that imports all anew.
     forkserver._forkserver._forkserver_address = server
     forkserver._forkserver.ensure_running = int
@@ -118,7 +122,10 @@ def _work(log: str, server: str, work: Callable, arguments: tuple) -> None:
     from src.figures import samples
 
     samples.draw_comparison = leave_slices_out
-    entry_point.run_main(lambda: work(*arguments))
+    if program:
+        work(*arguments)
+    else:
+        entry_point.run_main(lambda: work(*arguments))
 
 
 def run_entry_point(name: str, config: str) -> None:

@@ -38,7 +38,7 @@ class Server:
             "fps=30",
             "threads=1",
         ]
-        self.run = Run(folder / "log", run_program, "live", *overrides)
+        self.run = Run(folder / "log", run_program, "live", *overrides, program=True)
         self.address = f"http://127.0.0.1:{self.port}"
 
     def until_up(self) -> None:
