@@ -103,12 +103,20 @@ def in_float32(monkeypatch):
 
 
 @pytest.fixture
-def few_batches(monkeypatch):
-    """Two sizes of batches of tiles; test_from_tiles_to_the_whole_frame_and_back has them all."""
-    monkeypatch.setattr(setnet_tiles, "BATCHES", (8, 64))
+def two_batch_sizes(monkeypatch):
+    """Each size is compiled, for each network and frame: two of five."""
+    monkeypatch.setattr(setnet_tiles, "BATCHES", (8, 32))
 
 
-ACTIVITY = given(
+@pytest.mark.usefixtures("in_float32", "two_batch_sizes")
+@pytest.mark.parametrize("backend", FORMS)
+@settings(
+    max_examples=12,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(
     name=st.sampled_from(sorted(NETWORKS)),
     kinds=st.lists(
         st.sampled_from([QUIET, ALONE, BLOB, BLOB, EVERYWHERE]),
@@ -120,47 +128,13 @@ ACTIVITY = given(
     fps=st.sampled_from([120.0, 317.0, 600.0, 3000.0, 12000.0]),
     seed=st.integers(0, 999),
 )
-
-
-def examples(count: int) -> settings:
-    return settings(
-        max_examples=count,
-        deadline=None,
-        derandomize=True,
-        suppress_health_check=[HealthCheck.function_scoped_fixture],
-    )
-
-
-@examples(12)
-@ACTIVITY
-def test_any_activity_gives_the_dense_frames(name, kinds, size, views, fps, seed):
-    assert gap_of_activity("float32", name, kinds, size, views, fps, seed) < EXACT
-
-
-@examples(8)
-@ACTIVITY
-def test_any_activity_gives_the_dense_frames_on_openvino(
-    name, kinds, size, views, fps, seed, in_float32, few_batches
-):
-    """Fewer, as each compiles modules of its own."""
-    assert gap_of_activity("openvino", name, kinds, size, views, fps, seed) < EXACT
-
-
-def gap_of_activity(
-    backend: str,
-    name: str,
-    kinds: list[str],
-    size: tuple[int, int],
-    views: int,
-    fps: float,
-    seed: int,
-) -> float:
+def test_any_activity_gives_the_dense_frames(backend, name, kinds, size, views, fps, seed):
     height, width = size
     net, windows = NETWORKS[name], scene(kinds, seed, views, height, width, fps)
     live = EventListRuntime(
         net, positions=positions(views), height=height, width=width, threads=1, form=form(backend)
     )
-    return largest_gap(net, live, windows, views)
+    assert largest_gap(net, live, windows, views) < EXACT
 
 
 @pytest.mark.parametrize("backend", FORMS)

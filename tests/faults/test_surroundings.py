@@ -69,7 +69,8 @@ def test_a_damaged_checkpoint_is_passed_over(tmp_path):
 
 
 def test_a_folder_of_several_runs_says_which_one_is_taken(tmp_path):
-    last = [tmp_path / name / "checkpoints" / "last.ckpt" for name in ("new", "old", "no_run")]
+    runs = tmp_path / "runs"
+    last = [runs / name / "checkpoints" / "last.ckpt" for name in ("new", "old", "no_run")]
     for path, time in zip(last, (8, 7, 9), strict=True):
         path.parent.mkdir(parents=True)
         written(path, 1.0)
@@ -77,9 +78,9 @@ def test_a_folder_of_several_runs_says_which_one_is_taken(tmp_path):
         if time < 9:  # of any other folder no checkpoint is taken
             (path.parents[1] / "config.yaml").touch()
     with pytest.warns(UserWarning, match="holds 2 runs, the newest is taken: .*new/checkpoints"):
-        assert newest_checkpoint(tmp_path) == last[0]
+        assert newest_checkpoint(runs) == last[0]
     with pytest.raises(ValueError, match="ckpt must be a folder with a whole checkpoint"):
-        newest_checkpoint(tmp_path.parent)
+        newest_checkpoint(tmp_path)
 
 
 @pytest.mark.parametrize("kind", ["mp4", "png", "gif"])
