@@ -62,6 +62,21 @@ def no_slices():
         yield
 
 
+@pytest.fixture(autouse=True, scope="session")
+def one_timed_frame():
+    """Trainings and evaluations time one frame of a network, not the fastest of several."""
+    from src.deploy import cost
+
+    def time_one_frame(network: torch.nn.Module, voxels: torch.Tensor, **how) -> cost.Timing:
+        with pytest.MonkeyPatch.context() as fewer:
+            fewer.setattr(cost, "TIMED_FRAMES", 1)
+            return cost.time_frame(network, voxels, **how)
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("src.training.evaluation.time_frame", time_one_frame)
+        yield
+
+
 @pytest.fixture(autouse=True)
 def no_hydra_left():
     """What a test began by Hydra in this process is not what the next is run by."""

@@ -50,7 +50,7 @@ def test_every_experiment_takes_a_step(experiment, tmp_path):
 
 
 def test_weights_and_biases_holds_config_pictures_and_metrics(tmp_path):
-    train(config("train", tmp_path, *TINY, *LEAN, "logger=wandb"))
+    train(config("train", tmp_path, *TINY, *LEAN, "experiment=single256", "logger=wandb"))
     entry_point.finish_wandb()
     (run,) = (tmp_path / "wandb").glob("offline-run-*")
     words, late = (b"test/psnr_aligned", b"train/loss", b"epoch_clips"), time.monotonic() + 60
@@ -88,7 +88,8 @@ def test_every_choice_composes(tmp_path):
 
 
 def test_resuming_equals_not_having_stopped(tmp_path):
-    steps = [*UNDRAWN, "data.epoch_clips=2", "augment.noise_std=0.1", "scheduler.T_max=5"]
+    steps = [*UNDRAWN, "experiment=single256", "data.epoch_clips=2"]
+    steps += ["augment.noise_std=0.1", "scheduler.T_max=5"]
     whole, first, second = (tmp_path / name for name in ("whole", "first", "second"))
     train(config("train", whole, *TINY, *steps, "trainer.max_steps=5"))
     train(config("train", first, *TINY, *steps, "trainer.max_steps=3"))
@@ -104,9 +105,9 @@ def test_resuming_equals_not_having_stopped(tmp_path):
 
 
 def test_the_same_seed_gives_the_same_loss_curve(tmp_path):
-    curves, steps = [], [*UNDRAWN, "trainer.max_steps=2", "data.epoch_clips=2"]
+    curves, steps = [], [*UNDRAWN, "experiment=single256", "trainer.max_steps=2"]
     for run in ("a", "b"):
-        train(config("train", tmp_path / run, *TINY, *steps))
+        train(config("train", tmp_path / run, *TINY, *steps, "data.epoch_clips=2"))
         curves.append((tmp_path / run / "logs" / "metrics.csv").read_text())
     assert curves[0] == curves[1]
 

@@ -120,10 +120,11 @@ SMALL += [
     "sensor=randomized",
     "data.cache_clips=2",
 ]
+ONE_CLIP = ["data.cache_clips=1", "data.cache_windows=3", "data.cache_crop=32"]
 
 
 def test_all_that_ask_for_the_same_share_one_of_a_process(tmp_path):
-    asked = [*SMALL, "data.cache_device=device", "data.workers=0"]
+    asked = [*SMALL, *ONE_CLIP, "data.cache_device=device", "data.workers=0"]
     nine, one, other = (
         simulations.build_clip_cache(config("train", tmp_path, *asked, *more))
         for more in ([], ["optics=single", "data.crop=24"], ["seed=5"])
@@ -135,7 +136,7 @@ def test_all_that_ask_for_the_same_share_one_of_a_process(tmp_path):
 
 
 def test_one_that_no_pipeline_has_any_more_makes_room_for_the_next(tmp_path):
-    asked = [*SMALL, "data.cache_device=device", "data.workers=0"]
+    asked = [*SMALL, *ONE_CLIP, "data.cache_device=device", "data.workers=0"]
     first, second, third = (config("train", tmp_path, *asked, f"seed={n}") for n in (11, 12, 13))
     earlier = ref(simulations.build_clip_cache(first))
     used = simulations.build_pipeline(second, "train")
