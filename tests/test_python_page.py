@@ -30,6 +30,7 @@ SMALLER = {  # what a notebook says, and what is run here: seconds instead of mi
     "SECONDS = 0.4": "SECONDS = 0.1",
     "SIDE_PX = 256": "SIDE_PX = 96",
     "FILM_S = 2.0": "FILM_S = 0.5",
+    "longest_side_px=160": "longest_side_px=96",
     "END_S = 0.24": "END_S = 0.1",
     "STEPS = 40": "STEPS = 1",
     "CLIPS = 12": "CLIPS = 2",
