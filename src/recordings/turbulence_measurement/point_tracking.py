@@ -226,12 +226,17 @@ class _Windows:
         """Return the frame's windows, their weights, and the fields' windows that fall there."""
         whole = np.round(moved)
         at = (self.place + whole).astype(int)
-        x, y = at[:, :1] + self.u, at[:, 1:] + self.v
         height, width = frame.shape
-        inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-        seen = frame[y.clip(0, height - 1), x.clip(0, width - 1)]
+        if at.min(initial=REACH) >= REACH and (at + REACH < (width, height)).all():
+            first, offsets = at[:, :1] + at[:, 1:] * width, self.u + self.v * width
+            seen = frame.ravel()[first + offsets]
+            weight = np.repeat(self.weight[None], len(at), axis=0)
+        else:
+            x, y = at[:, :1] + self.u, at[:, 1:] + self.v
+            seen = frame[y.clip(0, height - 1), x.clip(0, width - 1)]
+            weight = self.weight * ((x >= 0) & (x < width) & (y >= 0) & (y < height))
         there = _window_pixels(self.home + (whole - moved), self.u, self.v)
-        return seen, self.weight * inside, [_sample_at(field, *there) for field in fields]
+        return seen, weight, [_sample_at(field, *there) for field in fields]
 
 
 def _sample(picture: np.ndarray, at: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:

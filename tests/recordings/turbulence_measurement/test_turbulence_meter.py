@@ -124,7 +124,7 @@ def blurred(ratio: float, frames: int = 30) -> np.ndarray:
     ])  # fmt: skip
 
 
-@pytest.mark.parametrize("ratio", [1.0, 1.2, 1.4, 1.8])
+@pytest.mark.parametrize("ratio", [1.0, pytest.param(1.2, marks=pytest.mark.slow), 1.4, 1.8])
 def test_blur_is_what_a_typical_moment_has_beyond_the_sharpest_tenth(ratio):
     frames = blurred(ratio)
     frames += 0.01 * np.random.default_rng(0).standard_normal(frames.shape).astype(np.float32)
@@ -182,14 +182,14 @@ def test_noise_of_the_two_displacements_is_independent(noise):
     assert abs((first * second).mean()) < 0.1 * (first**2).mean()
 
 
-@pytest.mark.parametrize("noise", [0.03, 0.05])
+@pytest.mark.parametrize("noise", [pytest.param(0.03, marks=pytest.mark.slow), 0.05])
 def test_noise_alone_is_no_tilt(noise):
     frames = film(np.zeros((60, 2, SIDE, SIDE)), noise)
     with pytest.raises(ValueError, match=r"turbulent air, got a tilt of 0.0\d* .* at \d\d+ points"):
         turbulence_meter.measure_turbulence(frames, 30.0)
 
 
-@pytest.mark.parametrize("quality", [50, 75])
+@pytest.mark.parametrize("quality", [50, pytest.param(75, marks=pytest.mark.slow)])
 def test_what_compression_adds_is_no_tilt(quality):
     files = [
         cv2.imencode(".jpg", np.uint8(255 * frame), [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
