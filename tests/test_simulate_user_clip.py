@@ -145,7 +145,7 @@ def test_without_turbulence_events_are_the_threshold_crossings_of_the_clip():
     assert first == pytest.approx(24 * 0.25 / np.log(8), abs=0.02)
 
 
-@pytest.mark.parametrize("seed", [0, 3])
+@pytest.mark.parametrize("seed", [0, pytest.param(3, marks=pytest.mark.slow)])
 def test_a_photograph_gives_events_by_default(tmp_path, seed):
     cv2.imwrite(str(tmp_path / "cat.png"), 255 * textured(2, (96, 128))[0])
     given = [f"photo={tmp_path}/cat.png", "seconds=0.2", f"seed={seed}", "optics.views=3"]

@@ -36,19 +36,27 @@ class CornerFold:
 
     def turn_halves(self, points: Points) -> Points:
         """Return the places in the centre view of points under the view's homography."""
-        return self._turn(points, self.angle_rad / 2)
+        return self.turn(points, self.angle_rad / 2)
 
     def turn_halves_back(self, points: Points) -> Points:
         """Return the inverse of `turn_halves`; what both halves or none show is in the nearer."""
-        return self._turn(points, -self.angle_rad / 2)
+        return self.turn(points, -self.angle_rad / 2)
 
     def signed_distance_px(self, points: Points) -> Float[np.ndarray, " n"]:
         """Return how far points lie from the line, in pixels; below 0 on the one side of it."""
+        return self._signed_distance_px(points)
+
+    def turn(self, points: np.ndarray, angle: float) -> np.ndarray:
+        """Return the points of each half turned by `angle`, away from the line.
+
+        Tests do not check the shapes, as this runs at every step of a fit.
+        """
+        x, y = (points - self.corner).T
+        side = np.sign(self._signed_distance_px(points))
+        sine, cosine = side * np.sin(angle), np.cos(angle)
+        return np.stack([cosine * x - sine * y, sine * x + cosine * y], axis=1) + self.corner
+
+    def _signed_distance_px(self, points: np.ndarray) -> np.ndarray:
         across, along = np.subtract(self.towards, self.corner)
         x, y = (points - self.corner).T
         return (across * y - along * x) / np.hypot(across, along)
-
-    def _turn(self, points: Points, angle: float) -> Points:
-        x, y = (points - self.corner).T
-        sine, cosine = np.sign(self.signed_distance_px(points)) * np.sin(angle), np.cos(angle)
-        return np.stack([cosine * x - sine * y, sine * x + cosine * y], axis=1) + self.corner

@@ -6,13 +6,14 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Int
 
+from src.recordings.corner_fold import Points
 from src.recordings.engines.splat import (
     list_bilinear_contributions,
     list_nearest_contributions,
     splat_and_count_outside,
 )
 from src.recordings.files.event_arrays import contiguous_columns
-from src.recordings.views import HeightWidth, Views
+from src.recordings.views import HeightWidth, View, Views
 
 MIN_DENSITY = 0.1  # where fewer sensor pixels than this map to a model pixel, no scaling up
 
@@ -96,19 +97,34 @@ def build_lookup(views: Views) -> SensorLookup:
     """Return the lookup of `views`; where two overlap, the one whose centre is nearer wins."""
     height, width = views.sensor
     y, x = np.mgrid[:height, :width].astype(np.float64)
-    sensor = np.stack([x.ravel(), y.ravel()], axis=1)
     best = np.full((height, width), np.inf)
     owner = np.full((height, width), -1, np.int16)
     model_xy = np.zeros((height, width, 2), np.float32)
     middle = (np.array(views.model[::-1]) - 1) / 2
     half = np.array(views.model[::-1]) / 2
     for index, view in enumerate(views.views):
-        uv = views.to_model(view, sensor).reshape(height, width, 2)
+        outline, (a, b, c) = views.outline(view), view.homography[2]
+        near = _surround(view, outline, views.sensor)
+        sensor = np.stack([x[near].ravel(), y[near].ravel()], axis=1)
+        uv = views.to_model(view, sensor).reshape(*x[near].shape, 2)
         # Beyond the homography's horizon the plane comes again.
-        a, b, c = view.homography[2]
-        depth = a * x + b * y + c
-        front = depth * (views.outline(view).mean(0) @ (a, b) + c) > 0
+        depth = a * x[near] + b * y[near] + c
+        front = depth * (outline.mean(0) @ (a, b) + c) > 0
         distance = np.abs((uv - middle) / half).max(-1)
-        mine = front & (distance <= 1) & (distance < best)
-        best[mine], owner[mine], model_xy[mine] = distance[mine], index, uv[mine]
+        mine = front & (distance <= 1) & (distance < best[near])
+        best[near][mine], owner[near][mine] = distance[mine], index
+        model_xy[near][mine] = uv[mine]
     return SensorLookup(owner, model_xy, len(views.views), views.model)
+
+
+def _surround(view: View, outline: Points, sensor: HeightWidth) -> tuple[slice, slice]:
+    """Return rows and columns that hold all of a view; of halves, or one that reaches its horizon,
+    those of the sensor."""
+    depth = np.append(outline, np.ones((4, 1)), axis=1) @ view.homography[2]
+    if view.fold or abs(np.sign(depth).sum()) < 4:
+        return slice(0, sensor[0]), slice(0, sensor[1])
+    (left, top), (right, bottom) = outline.min(0), outline.max(0)
+    first = np.clip(np.floor([top, left]) - 1, 0, sensor).astype(int)
+    last = np.clip(np.ceil([bottom, right]) + 2, 0, sensor).astype(int)
+    rows, columns = (slice(*ends) for ends in zip(first.tolist(), last.tolist(), strict=True))
+    return rows, columns

@@ -1,5 +1,7 @@
 """A simulated recording read back: its geometry, its motion and its turbulence are found again."""
 
+from dataclasses import replace
+
 import h5py
 import numpy as np
 import pytest
@@ -17,9 +19,9 @@ from tests.recordings import pictures
 from tests.recordings.test_views import distance_px, split
 from tests.recordings.turbulence_measurement.test_dot_statistics import sampling_error, series
 
-SENSOR, SIDE, TILE = (360, 640), 120, 116.0
+SENSOR, SIDE, TILE = (360, 364), 120, 116.0
 VIEWS = [0, 1, 3, 4]  # mirrored both ways, in y, in x and not: the centre view
-DOTS = [1, 3, 4, 5, 7]  # of 3 x 3
+DOTS = [1, 4, 5]  # of 3 x 3: above, in and right of the middle
 
 
 def noisy_sensor(**changes) -> EventSensor:
@@ -193,18 +195,19 @@ def test_views_turn_about_the_centre_one(truth):
 
 
 def dot_films(frames: int = 120) -> tuple[torch.Tensor, np.ndarray, np.ndarray]:
-    """Return dots (9, frames, h, w) with tilts (frames, 9 views x 9 dots, 2) and spreads."""
+    """Return dots (VIEWS, frames, h, w) with tilts (frames, 9 views x 9 dots, 2) and spreads."""
     grid = np.array([[x, y] for y in (30.0, 60.0, 90.0) for x in (30.0, 60.0, 90.0)])
     tilt = 0.8 * series(frames, 81, 0.7, seed=7).reshape(frames, 9, 9, 2)
     tilt[:, :, 1:] = 0.6 * tilt[:, :, :1] + 0.8 * tilt[:, :, 1:]  # within a view dots share a part
     sigma = 3.0 + 0.4 * np.random.default_rng(8).normal(size=(frames, 9, 9))
     dark = np.full((frames, 9), -0.6)
-    films = [pictures.dot_grid(grid + tilt[:, v], sigma[:, v], dark, SIDE) for v in range(9)]
+    films = [pictures.dot_grid(grid + tilt[:, v], sigma[:, v], dark, SIDE) for v in VIEWS]
     return torch.from_numpy(np.stack(films)).float(), tilt, sigma
 
 
 def fits_of(films: torch.Tensor, truth: views.Views, places=None) -> tuple[list, np.ndarray]:
-    """Film the views on the sensor, register them again and fit `DOTS` of `VIEWS`."""
+    """Film `VIEWS` on the sensor, register them again and fit `DOTS`."""
+    truth = replace(truth, views=tuple(truth.views[v] for v in VIEWS))
     table = sensor_lookup.build_lookup(truth)
     seen = simulated_recording.render_sensor_frames(
         films, table, simulated_recording.vignette_gain(table, 0.3), slice(None)
@@ -212,8 +215,8 @@ def fits_of(films: torch.Tensor, truth: views.Views, places=None) -> tuple[list,
     seen = seen + 0.005 * torch.randn(seen.shape, generator=torch.Generator().manual_seed(0))
     registered = np.stack([truth.warp_to_model(frame) for frame in seen.numpy()], axis=1)
     if places is None:
-        places = dot_statistics.find_dots(registered[4].mean(0), 3, 3)[DOTS]
-    return [gaussian_dots.fit_gaussians(registered[v], places, 12) for v in VIEWS], places
+        places = dot_statistics.find_dots(registered[VIEWS.index(4)].mean(0), 3, 3)[DOTS]
+    return [gaussian_dots.fit_gaussians(view, places, 12) for view in registered], places
 
 
 def test_statistics_are_those_of_the_simulated_turbulence(truth):
@@ -222,7 +225,7 @@ def test_statistics_are_those_of_the_simulated_turbulence(truth):
         np.array([[[x, y] for y in (30.0, 60.0, 90.0) for x in (30.0, 60.0, 90.0)]] * 6),
         np.full((6, 9), 2.4), np.full((6, 9), -0.6), SIDE,
     )  # fmt: skip
-    still, places = fits_of(torch.from_numpy(calm).float()[None].expand(9, -1, -1, -1), truth)
+    still, places = fits_of(torch.from_numpy(calm).float()[None].expand(4, -1, -1, -1), truth)
     turbulent, _ = fits_of(films, truth, places)
     found = dot_statistics.compare_with_still(turbulent, still, fps=60.0, centre_view=3)
     assert found.failed.sum() == 0
@@ -237,5 +240,5 @@ def test_statistics_are_those_of_the_simulated_turbulence(truth):
     # The dots' flux goes as sigma squared here, which is what scintillation has to find.
     flux = sigma[:, 4, 4] ** 2
     index = flux.var() / flux.mean() ** 2
-    assert found.scintillation[3, 2] == pytest.approx(index, rel=0.15)
+    assert found.scintillation[3, 1] == pytest.approx(index, rel=0.15)
     assert found.still_scintillation[3].max() < 0.1 * index

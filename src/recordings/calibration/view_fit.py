@@ -86,17 +86,22 @@ def _fit(
     start, shape = np.vstack([affine, [0, 0, 1]]), _normalise(tile)
     back, shape_px = np.linalg.inv(shape), 1 / np.diag(shape)[:2].mean()
 
-    def view(change: np.ndarray) -> View:
+    def homography(change: np.ndarray) -> np.ndarray:
         moved = np.eye(3) + np.append(change[:8], 0).reshape(3, 3)
         matrix = back @ moved @ shape @ start
-        turned = None
-        if fold:
-            angle = np.clip(change[8], -MAX_ANGLE_RAD, MAX_ANGLE_RAD)
-            turned = replace(fold, angle_rad=float(angle))
-        return View(position, matrix / matrix[2, 2], fold=turned)
+        return matrix / matrix[2, 2]
+
+    def angle_rad(change: np.ndarray) -> float:
+        return float(np.clip(change[8], -MAX_ANGLE_RAD, MAX_ANGLE_RAD))
+
+    def view(change: np.ndarray) -> View:
+        turned = replace(fold, angle_rad=angle_rad(change)) if fold else None
+        return View(position, homography(change), fold=turned)
 
     def errors(change: np.ndarray) -> np.ndarray:
-        off = view(change).to_centre(at) - places
+        placed = cv2.perspectiveTransform(at[None], homography(change))[0]
+        placed = fold.turn(placed, angle_rad(change) / 2) if fold else placed
+        off = placed - places
         return np.concatenate([off.ravel(), change * shape_px * ROBUST_PX / LOOSE_PX])
 
     zero = np.zeros(9 if fold else 8)

@@ -226,17 +226,30 @@ class _Windows:
         """Return the frame's windows, their weights, and the fields' windows that fall there."""
         whole = np.round(moved)
         at = (self.place + whole).astype(int)
-        x, y = at[:, :1] + self.u, at[:, 1:] + self.v
         height, width = frame.shape
-        inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-        seen = frame[y.clip(0, height - 1), x.clip(0, width - 1)]
-        here = self.home + (whole - moved)
-        return seen, self.weight * inside, [_sample(f, here, self.u, self.v) for f in fields]
+        if at.min(initial=REACH) >= REACH and (at + REACH < (width, height)).all():
+            first, offsets = at[:, :1] + at[:, 1:] * width, self.u + self.v * width
+            seen = frame.ravel()[first + offsets]
+            weight = np.repeat(self.weight[None], len(at), axis=0)
+        else:
+            x, y = at[:, :1] + self.u, at[:, 1:] + self.v
+            seen = frame[y.clip(0, height - 1), x.clip(0, width - 1)]
+            weight = self.weight * ((x >= 0) & (x < width) & (y >= 0) & (y < height))
+        there = _window_pixels(self.home + (whole - moved), self.u, self.v)
+        return seen, weight, [_sample_at(field, *there) for field in fields]
 
 
 def _sample(picture: np.ndarray, at: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Return the picture (points, pixels) at `at` + (u, v), cubic; beyond the edge it is held."""
-    x, y = (at[:, 0, None] + u).astype(np.float32), (at[:, 1, None] + v).astype(np.float32)
+    return _sample_at(picture, *_window_pixels(at, u, v))
+
+
+def _window_pixels(at: np.ndarray, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return x and y (points, pixels) of `at` + (u, v)."""
+    return (at[:, 0, None] + u).astype(np.float32), (at[:, 1, None] + v).astype(np.float32)
+
+
+def _sample_at(picture: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return cv2.remap(picture, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
 
 

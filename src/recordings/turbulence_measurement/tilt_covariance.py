@@ -125,7 +125,10 @@ class CovarianceModel:
         self.lengths = np.append(np.geomspace(MIN_LENGTH_PX, self.side, 30), 100 * self.side)
         self.fitted_distance_px = np.geomspace(0.25, 1.4 * self.side, 1200)
         points = np.random.default_rng(0).uniform(0, self.side, (2, 20000, 2))
-        self.pairs = np.hypot(*(points[0] - points[1]).T)  # of a square view
+        pairs = np.hypot(*(points[0] - points[1]).T)  # of a square view
+        order = np.argsort(pairs)  # np.interp is fast for what ascends
+        self.pairs, self._unsorted = pairs[order], np.argsort(order)
+        self._near = int(np.searchsorted(self.pairs, 4 * SPREAD))
 
     def describe_tilt(
         self, product: Distances, count: Distances, lags: Float[np.ndarray, " lags"], frames: int
@@ -141,9 +144,9 @@ class CovarianceModel:
         fitted = np.interp(self.distance, self.fitted_distance_px, curve)
         filled_correlation = np.where(count > MIN_PAIRS, correlation, fitted)
         # Beyond the shortest distances what was measured is taken as it is, negative values too.
-        far = np.interp(self.pairs, self.distance[1:], filled_correlation[1:])
-        near = np.interp(self.pairs, self.fitted_distance_px, curve)
-        uniform = float(np.where(self.pairs < 4 * SPREAD, near, far).mean())
+        near = np.interp(self.pairs[: self._near], self.fitted_distance_px, curve)
+        far = np.interp(self.pairs[self._near :], self.distance[1:], filled_correlation[1:])
+        uniform = float(np.concatenate([near, far])[self._unsorted].mean())
         # A film's own mean was taken off: 1 - left of the power, at every distance alike.
         return TiltStatistics(
             power_px2=float(power / left),
@@ -179,11 +182,13 @@ def _correlation_over_lags(
     measured = np.minimum(product / max(power, 1e-12), 1.0)
     measured[0] = 1.0  # what is more is the error of tracking
     share = (1 - np.arange(1, len(product)) / frames) * 2 / frames
-    lost = 0.0
+    lost, before = 0.0, -1.0
     for _ in range(50):
+        if lost == before:
+            break
         true = lost + (1 - lost) * measured
         positive = np.logical_and.accumulate(true > 0)
-        lost = min(1 / frames + float(share @ (true * positive)[1:]), 0.9)
+        lost, before = min(1 / frames + float(share @ (true * positive)[1:]), 0.9), lost
     return lost + (1 - lost) * measured, 1 - lost
 
 

@@ -113,18 +113,18 @@ def test_half_length_beyond_the_frame_is_a_bound():
     assert half.low > 100 and found.global_tilt_share.value > 0.95
 
 
-def blurred(ratio: float) -> np.ndarray:
-    """Return 30 frames, a tenth of them blurred by 1.2 px, the rest `ratio` times as much."""
-    widths = np.full(30, 1.2 * ratio)
+def blurred(ratio: float, frames: int = 30) -> np.ndarray:
+    """Return frames, a tenth of them blurred by 1.2 px, the rest `ratio` times as much."""
+    widths = np.full(frames, 1.2 * ratio)
     widths[::10] = 1.2
-    push = fields(10, 0.2, 0.0, 30)
+    push = fields(10, 0.2, 0.0, frames)
     return np.stack([
         cv2.GaussianBlur(frame, (0, 0), width)
         for frame, width in zip(film(push, 0.0), widths, strict=True)
     ])  # fmt: skip
 
 
-@pytest.mark.parametrize("ratio", [1.0, 1.2, 1.4, 1.8])
+@pytest.mark.parametrize("ratio", [1.0, pytest.param(1.2, marks=pytest.mark.slow), 1.4, 1.8])
 def test_blur_is_what_a_typical_moment_has_beyond_the_sharpest_tenth(ratio):
     frames = blurred(ratio)
     frames += 0.01 * np.random.default_rng(0).standard_normal(frames.shape).astype(np.float32)
@@ -154,7 +154,7 @@ def test_a_decay_of_a_frame_or_two_is_that_of_its_exponential(frames):
 def test_blur_is_that_of_a_frame_of_256_px():
     large = np.stack([
         cv2.resize(frame, None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC)
-        for frame in blurred(1.4)
+        for frame in blurred(1.4, 20)
     ])  # fmt: skip
     small = np.stack([turbulence_meter.limit_shorter_side(frame, 256) for frame in large])
     found, wanted = (
@@ -182,14 +182,14 @@ def test_noise_of_the_two_displacements_is_independent(noise):
     assert abs((first * second).mean()) < 0.1 * (first**2).mean()
 
 
-@pytest.mark.parametrize("noise", [0.03, 0.05])
+@pytest.mark.parametrize("noise", [pytest.param(0.03, marks=pytest.mark.slow), 0.05])
 def test_noise_alone_is_no_tilt(noise):
     frames = film(np.zeros((60, 2, SIDE, SIDE)), noise)
     with pytest.raises(ValueError, match=r"turbulent air, got a tilt of 0.0\d* .* at \d\d+ points"):
         turbulence_meter.measure_turbulence(frames, 30.0)
 
 
-@pytest.mark.parametrize("quality", [50, 75])
+@pytest.mark.parametrize("quality", [50, pytest.param(75, marks=pytest.mark.slow)])
 def test_what_compression_adds_is_no_tilt(quality):
     files = [
         cv2.imencode(".jpg", np.uint8(255 * frame), [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
@@ -324,14 +324,14 @@ def test_calibrate_refuses_and_writes_nothing(folder, wrong, message, tmp_path):
 
 def test_footage_of_a_building_and_of_a_panning_camera(shared_data):
     found = turbulence_meter.measure_turbulence(
-        _frames(shared_data / "turbulence/building", slice(20))
+        _frames(shared_data / "turbulence/building", slice(16))
     ).found
     assert 0.6 < found.tilt_rms_px.value < 0.95
     assert 5 < found.tilt_correlation_half_length_px.value < 20
     assert 0.1 < found.global_tilt_share.value < 0.45
     with pytest.raises(ValueError, match="stands still"):
         turbulence_meter.measure_turbulence(
-            _frames(shared_data / "turbulence/TSR_phys_0212.mp4", slice(0, 100, 5))
+            _frames(shared_data / "turbulence/TSR_phys_0212.mp4", slice(0, 80, 5))
         )
 
 
