@@ -125,9 +125,8 @@ class CovarianceModel:
         self.lengths = np.append(np.geomspace(MIN_LENGTH_PX, self.side, 30), 100 * self.side)
         self.fitted_distance_px = np.geomspace(0.25, 1.4 * self.side, 1200)
         points = np.random.default_rng(0).uniform(0, self.side, (2, 20000, 2))
-        pairs = np.hypot(*(points[0] - points[1]).T)  # of a square view
-        order = np.argsort(pairs)  # np.interp is fast for what ascends
-        self.pairs, self._unsorted = pairs[order], np.argsort(order)
+        # Distances of pairs in a square view, ascending: np.interp is faster for them.
+        self.pairs = np.sort(np.hypot(*(points[0] - points[1]).T))
         self._near = int(np.searchsorted(self.pairs, 4 * SPREAD))
 
     def describe_tilt(
@@ -146,7 +145,7 @@ class CovarianceModel:
         # Beyond the shortest distances what was measured is taken as it is, negative values too.
         near = np.interp(self.pairs[: self._near], self.fitted_distance_px, curve)
         far = np.interp(self.pairs[self._near :], self.distance[1:], filled_correlation[1:])
-        uniform = float(np.concatenate([near, far])[self._unsorted].mean())
+        uniform = float(np.concatenate([near, far]).mean())
         # A film's own mean was taken off: 1 - left of the power, at every distance alike.
         return TiltStatistics(
             power_px2=float(power / left),
