@@ -195,7 +195,7 @@ def launches() -> None:
 
 def prepare_clips() -> list:
     """Return random turbulence as training sees it, ready for a device."""
-    from scripts.parallel_fill import prepare_turbulence
+    from src.training.parallel_fill import prepare_turbulence
 
     operators = [Turbulence(path, views=9, height=256, width=256) for path in draw_atmospheres()]
     return [

@@ -13,10 +13,10 @@ import hydra
 import torch
 from omegaconf import DictConfig
 
-from scripts.parallel_fill import fill
 from src.app import entry_point, simulation
 from src.app.renamed_keys import refuse_renamed_keys
 from src.training.disk_cache import DiskClipCache
+from src.training.parallel_fill import fill
 from src.training.worker_process import prepare_worker_process
 
 REPORT_S = 10.0  # between two lines

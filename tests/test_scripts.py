@@ -10,7 +10,6 @@ from safetensors.torch import load_file
 
 from scripts import (
     error_by_detail_size,
-    fit_p2s,
     gallery,
     pretrain_context,
     readme,
@@ -19,6 +18,7 @@ from scripts import (
     widen_setnet,
 )
 from scripts.error_by_detail_size import measure, missing
+from scripts.fit_p2s import __main__ as fit_p2s
 from scripts.ship_weights import CARD_NOTE, Given, rewrite_card, ship
 from src.app import build
 from src.metrics.table import METRICS

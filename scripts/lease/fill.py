@@ -7,8 +7,8 @@ from contextlib import ExitStack
 
 from scripts.lease.plan import Fill
 from scripts.lease.probe import GIB, MEMORY_FACTOR, UNUSED_GIB, Device, Trial, free_memory
-from scripts.parallel_fill import FillReport, SimulatedClips, store_clips
 from src.training.clip_cache import CachedClip, DeviceClipCache
+from src.training.parallel_fill import FillReport, SimulatedClips, store_clips
 
 MAX_WORKERS = 15
 ENDLESS = range(2**31)  # numbers of clips

@@ -32,8 +32,9 @@ from src.training.worker_process import prepare_worker_process
 
 INPUTS_FILE = "inputs.json"
 # Parts of src/sim that no cached clip depends on, but for UPSTREAM, which decodes its frames.
-NOT_HASHED, UPSTREAM = ("sensor", "voxel.py", "scenes/user_clip.py"), "sensor/response.py"
+UNUSED, UPSTREAM = ("sensor", "voxel.py", "scenes/user_clip.py"), "sensor/response.py"
 MEASURED = "recordings/files/turbulence_file.py"  # in src, draws turbulence=measured
+DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 
 
 class DiskClipCache(ClipCache):
@@ -170,25 +171,32 @@ def _fill_caches(caches: Sequence[DiskClipCache]) -> None:
 
 
 @functools.cache
-def hash_simulation_code(measured: str = MEASURED) -> str:
-    """Return a hash of the code and tables that make clips: comments and layout do not count.
-    `measured`: the file in src that draws turbulence=measured."""
-    home, digest = Path(src.sim.__file__).parent, hashlib.sha256()
-    digest.update(_hash_input(home.parent / measured))
-    for path in sorted(home.rglob("*")):
-        place = path.relative_to(home)
-        if any(map(place.is_relative_to, NOT_HASHED)) and place.as_posix() != UPSTREAM:
-            continue
-        if path.suffix not in (".py", ".safetensors"):
-            continue
-        digest.update(str(place).encode() + _hash_input(path))
+def hash_simulation_code() -> str:
+    """Return a hash of the code and tables that make clips, `list_simulation_files`."""
+    digest, root = hashlib.sha256(), Path(src.sim.__file__).parent.parent
+    for path in list_simulation_files():
+        digest.update(path.relative_to(root).as_posix().encode() + read_effective_content(path))
     return digest.hexdigest()[:12]
 
 
-def _hash_input(path: Path) -> bytes:
-    if path.suffix == ".py":
-        return ast.dump(ast.parse(path.read_text())).encode()
-    return path.read_bytes()
+def list_simulation_files() -> list[Path]:
+    """Return the files of code and tables that a cached clip depends on."""
+    home = Path(src.sim.__file__).parent
+    files = [path for path in home.rglob("*") if path.suffix in (".py", ".safetensors")]
+    parts = [home / part for part in UNUSED]
+    used = [path for path in files if not any(map(path.is_relative_to, parts))]
+    return sorted([*used, home / UPSTREAM, home.parent / MEASURED])
+
+
+def read_effective_content(path: Path) -> bytes:
+    """Return what a file says: of code, all but comments, docstrings and layout."""
+    if path.suffix != ".py":
+        return path.read_bytes()
+    tree = ast.parse(path.read_text())
+    for node in ast.walk(tree):
+        if isinstance(node, DOCUMENTED) and ast.get_docstring(node, clean=False) is not None:
+            del node.body[0]
+    return ast.dump(tree).encode()
 
 
 def hash_file_lists(config: Any) -> str:

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import torch
 
-from scripts.parallel_fill import fill
 from src.sim.optics import Optics
 from src.sim.pipeline import Pipeline
 from src.sim.sensor import EventSensor
 from src.sim.turbulence.simulated import SimulatedTurbulence
 from src.training.disk_cache import CacheFillerProcess, DiskClipCache
+from src.training.parallel_fill import fill
 from tests.sim.test_pipeline import Waves
 
 MIXED = SimulatedTurbulence({"severity": "mixed"}, temporal_model="mixed")

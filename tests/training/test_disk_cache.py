@@ -434,11 +434,26 @@ def test_files_in_linked_folders_are_in_the_hash_hidden_ones_are_not(tmp_path):
     assert hashes[0] == hashes[1] != hashes[2]
 
 
-def test_the_file_that_draws_measured_turbulence_is_in_the_hash():
-    assert hash_simulation_code("recordings/files/time_unit.py") != hash_simulation_code()
+def test_the_hash_is_of_what_makes_clips():
+    files = {path.name for path in disk_caches.list_simulation_files()}
+    assert {"turbulence_file.py", "response.py", "p2s.py", "p2s.safetensors"} <= files
+    assert not {"sensor.py", "voxel.py", "user_clip.py"} & files
+
+
+def test_comments_docstrings_and_layout_of_code_are_not_hashed(tmp_path):
+    texts = (
+        '"""A."""\nclass A:\n    """B."""\n    def f(self):\n        """C."""\n        return 1\n',
+        "class A:\n    # other\n    def f(self):\n        return (\n            1)\n",
+        "class A:\n    def f(self):\n        return 2\n",
+    )
+    contents = []
+    for text in texts:
+        (tmp_path / "a.py").write_text(text)
+        contents.append(disk_caches.read_effective_content(tmp_path / "a.py"))
+    assert contents[0] == contents[1] != contents[2]
 
 
 def test_code_is_hashed_once_a_process(monkeypatch):
     before = hash_simulation_code()
-    monkeypatch.setattr(disk_caches, "_hash_input", None)
+    monkeypatch.setattr(disk_caches, "read_effective_content", None)
     assert hash_simulation_code() == before

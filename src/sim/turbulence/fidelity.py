@@ -2,9 +2,9 @@
 
 Errors are powers, as shares of the power by which turbulence at random changes a picture (its blur
 against the mean blur, tilt apart) with the spectrum 1 / f^2 of natural ones.  The tables behind
-them are measured on exact PSFs, over D/r0 and lambda / D in pixels, by scripts/p2s_errors.py and
-kept beside the networks.  Times are those of one core (AVX2) per pixel of a view; what counts is
-their ratio.
+them are measured on exact PSFs, over D/r0 and lambda / D in pixels, by scripts/fit_p2s/errors.py
+and kept beside the networks.  Times are those of one core (AVX2) per pixel of a view; their ratio
+is what counts.
 """
 
 import math

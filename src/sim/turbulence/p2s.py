@@ -10,7 +10,7 @@ half a turn and change its sign, and the PSF stays as it is.  So every Zernike m
 function of the basis is of one of four parities: even (0), odd along x (1), odd along y (2) or odd
 along both (3); products have the parity 1 ^ 2 = 3 and so on, and modes of parities 0 and 3, whose n
 is even, can only come in pairs.  Linear forms of each parity and their products have this symmetry
-by construction.  scripts/p2s_training.py has the layers one by one.
+by construction.  scripts/fit_p2s/training.py has the layers one by one.
 """
 
 from collections.abc import Mapping

@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from benchmarks.turbulence import Work, kernels
-from scripts.parallel_fill import PreparedTurbulence, prepare_turbulence
 from src.sim.turbulence import clip_rendering, sample_atmosphere
 from src.sim.turbulence.clip_plan import ALIGNMENT, PackedTensors, _wave_tables
 from src.sim.turbulence.coefficient_grid import (
@@ -27,6 +26,7 @@ from src.sim.turbulence.operator import Turbulence
 from src.sim.turbulence.p2s import FittedPSFs, load_bands_by_d_over_r0
 from src.sim.turbulence.plane_waves import draw_plane_waves
 from src.sim.turbulence.simulated import SimulatedTurbulence
+from src.training.parallel_fill import PreparedTurbulence, prepare_turbulence
 from tests.sim.turbulence.test_turbulence import PATH, operator, seed
 
 CROP = (9, 17, 30, 40)

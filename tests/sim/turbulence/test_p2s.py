@@ -5,8 +5,8 @@ import pytest
 import torch
 from torch.nn import functional
 
-from scripts.exact_psf import fraunhofer_psf
-from scripts.p2s_training import TrainableNetwork
+from scripts.fit_p2s.exact_psf import fraunhofer_psf
+from scripts.fit_p2s.training import TrainableNetwork
 from src.sim.turbulence.engines.network_numba import BLOCK, evaluate_psf_network
 from src.sim.turbulence.p2s import (
     PhaseToSpaceNetwork,

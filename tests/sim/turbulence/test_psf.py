@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from scripts.exact_psf import fraunhofer_psf
-from scripts.p2s_errors import exact_psfs
+from scripts.fit_p2s.errors import exact_psfs
+from scripts.fit_p2s.exact_psf import fraunhofer_psf
 from src.sim.turbulence.p2s import (
     FILE,
     FittedPSFs,

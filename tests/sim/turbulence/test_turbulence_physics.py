@@ -12,7 +12,7 @@ from functools import cache
 import pytest
 import torch
 
-from scripts.exact_psf import fraunhofer_psf, noll_covariance
+from scripts.fit_p2s.exact_psf import fraunhofer_psf, noll_covariance
 from src.sim import noise
 from src.sim.turbulence.atmosphere import Atmosphere
 from src.sim.turbulence.coefficient_grid import WaveSum

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from scripts.exact_psf import fraunhofer_psf
+from scripts.fit_p2s.exact_psf import fraunhofer_psf
 from src.sim.turbulence.unresolved_blur import (
     blur_by_phase,
     missing_structure_function,

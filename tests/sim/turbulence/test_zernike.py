@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from scripts.exact_psf import noll_covariance, zernike_basis
+from scripts.fit_p2s.exact_psf import noll_covariance, zernike_basis
 from src.sim.turbulence.zernike import noll_index, pupil_filter
 
 

@@ -10,7 +10,7 @@ import torch
 from scipy import optimize, special
 from torch.nn import functional
 
-from scripts.exact_psf import fraunhofer_psf, noll_covariance
+from scripts.fit_p2s.exact_psf import fraunhofer_psf, noll_covariance
 from src.sim import noise
 from src.sim.turbulence import clip_rendering
 from src.sim.turbulence.atmosphere import Atmosphere

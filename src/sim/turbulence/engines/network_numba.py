@@ -25,7 +25,7 @@ def evaluate_psf_network(phase, first, common, gates, pairs, last):
     for start in range(0, phase.shape[1], BLOCK):
         stop = min(start + BLOCK, phase.shape[1])
         for i in range(len(phase)):
-            given[i, : stop - start] = phase[i, start:stop]
+            _copy(phase[i, start:stop], given[i])
         _multiply(first, used[0], given, forms)
         _times(forms[:wide], forms[:wide], squares[:wide])
         _multiply(common, used[1], squares, known)
@@ -38,8 +38,15 @@ def evaluate_psf_network(phase, first, common, gates, pairs, last):
         _times(mixed, forms[wide + 4 * few :], parts[three:])
         _multiply(last, used_last, parts, found)
         for i in range(len(out)):
-            out[i, start:stop] = found[i, : stop - start]
+            _copy(found[i, : stop - start], out[i, start:stop])
     return out
+
+
+@njit(nogil=True)
+def _copy(line, to):
+    """Write `line` to the first of `to`.  Numba compiles `to[:] = line` for a second longer."""
+    for x in range(len(line)):
+        to[x] = line[x]
 
 
 @njit(nogil=True)
@@ -67,8 +74,8 @@ def _multiply(matrix, used, inputs, out):
     for pair in range(len(used)):
         top, bottom = matrix[2 * pair], matrix[min(2 * pair + 1, len(matrix) - 1)]
         line, below = out[2 * pair], out[2 * pair + 1]
-        line[:] = ZERO
-        below[:] = ZERO
+        line.fill(ZERO)
+        below.fill(ZERO)
         count, own = used[pair, 0], used[pair, 1:]
         fours = count // 4 * 4
         for i in range(0, fours, 4):

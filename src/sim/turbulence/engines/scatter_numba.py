@@ -23,8 +23,10 @@ def scatter_normalised(image, nodes, frame, basis, ends, row, column, pitch, hal
     below = np.empty((size, size, width if pitch > 1 else 0), np.float32)
     lines = np.empty((nodes.shape[0], width), np.float32)
     sums = np.empty((4, width), np.float32)
-    cells = (np.arange(width) + column) // pitch
-    lates = ((np.arange(width) + column - cells * pitch) / pitch).astype(np.float32)
+    cells, lates = np.empty(width, np.int64), np.empty(width, np.float32)
+    for x in range(width):
+        cells[x] = (x + column) // pitch
+        lates[x] = (x + column - cells[x] * pitch) / pitch
     last, current = nodes.shape[2] - 1, -2
     for y in range(height):
         cell = (y + row) // pitch
@@ -53,8 +55,9 @@ def _stretch(nodes, frame, row, pitch, cells, lates, lines):
     width, end = lines.shape[1], nodes.shape[3] - 1
     for i in range(lines.shape[0]):
         node, line = nodes[i, frame, row], lines[i]
-        if pitch == 1:
-            line[:] = node
+        if pitch == 1:  # numba compiles `line[:] = node` for a second longer
+            for x in range(width):
+                line[x] = node[x]
             continue
         for x in range(width):
             low, high = node[cells[x]], node[min(cells[x] + 1, end)]
@@ -72,8 +75,8 @@ def _draw(lines, basis, ends, sums, full):
     for i in range(middle + 1):
         for j in range(middle + 1):
             shape = basis[i, j]
-            sums[0] = shape[0]
-            sums[1:] = np.float32(0.0)
+            sums.fill(np.float32(0.0))
+            sums[0].fill(shape[0])
             first = 0
             for kind in range(4):
                 _sum(sums[kind], lines, shape, first, ends[kind])

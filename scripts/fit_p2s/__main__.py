@@ -15,14 +15,14 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from scripts.p2s_errors import (
+from scripts.fit_p2s.errors import (
     draw_phase,
     exact_psfs,
     measure_error_tables,
     picture_metric,
     symmetrise_psf,
 )
-from scripts.p2s_training import TrainableNetwork
+from scripts.fit_p2s.training import TrainableNetwork
 from src.app.script import run_script
 from src.records.atomic import atomic_path, check_writable
 from src.sim.turbulence.p2s import EDGE_MARGIN, FILE, basis_parities, read_bands
@@ -153,7 +153,7 @@ def train_network(
 
 def main() -> None:
     """Read the arguments."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser("python -m scripts.fit_p2s", description=__doc__)
     parser.add_argument(
         "steps", type=int, nargs="?", default=12_000, help="default 12000; 0: tables only"
     )

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from scripts.exact_psf import fraunhofer_psf, noll_covariance
+from scripts.fit_p2s.exact_psf import fraunhofer_psf, noll_covariance
 from src.sim.turbulence.atmosphere import TILT_VARIANCE, Atmosphere
 from src.sim.turbulence.p2s import PSFBand, basis_parities
 from src.sim.turbulence.plane_waves import draw_plane_waves

@@ -15,16 +15,16 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from scripts import parallel_fill
 from scripts.lease import fill as lease_fill
 from scripts.lease.plan import Fill
 from scripts.lease.probe import Device, Trial
-from scripts.parallel_fill import FillReport, fill
 from src.sim.optics import Optics
 from src.sim.pipeline import Pipeline, crop_frames
 from src.sim.sensor import EventSensor
+from src.training import parallel_fill
 from src.training.clip_cache import CachedClip, CachedPipeline, DeviceClipCache
 from src.training.disk_cache import DiskClipCache
+from src.training.parallel_fill import FillReport, fill
 from tests.faults.harness import FORKS, Run
 from tests.sim.test_pipeline import Waves
 from tests.training.cache_sources import Broken, Growing, Other, Telling, fill_for_ever, source
