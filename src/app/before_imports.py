@@ -2,12 +2,14 @@
 
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from src.app import console
 from src.app.help import show_help
 
+INPUTS = ("recording", "video", "videos", "photo", "run")  # keys of files and folders that are read
 OPTION_OF_HYDRA = re.compile(r"-|\+*hydra(?!\.run\.dir=)")  # that folder is none
 
 
@@ -22,7 +24,7 @@ def answer_before_imports(config: str, file: Path) -> None:
 
 def refuse_wrong_overrides(config: str, words: Sequence[str]) -> None:
     """End the process with one line and exit code 2 for a key, a choice or a value in `words` that
-    conf/<config>.yaml does not take.
+    conf/<config>.yaml does not take, one that it lacks and an input that is not there.
 
     Words with options of Hydra, such as -m or hydra.searchpath, are left to Hydra: there may be
     other configs, or several jobs.
@@ -32,6 +34,22 @@ def refuse_wrong_overrides(config: str, words: Sequence[str]) -> None:
     if any(map(OPTION_OF_HYDRA.match, words)):
         return
     try:
-        compose_checked_config(config, [], words)
+        refuse_missing_inputs(compose_checked_config(config, [], words))
     except ValueError as error:
         console.exit_with_error(str(error))
+
+
+def refuse_missing_inputs(cfg: Mapping[str, Any]) -> None:
+    """Raise ValueError for a key that must be given and an input that is not there."""
+    from omegaconf import OmegaConf
+
+    missing = [key for key in cfg if OmegaConf.is_missing(cfg, key)]
+    unused = "recording" if "task" not in missing and cfg["task"] == "air" else "video"
+    for key in missing:
+        if key != unused:  # calibrate has both
+            raise ValueError(f"{key} must be given: {key}=...")
+    for key in INPUTS:
+        value = cfg.get(key) if key not in missing else None
+        for path in map(str, [value] if isinstance(value, str) else value or []):
+            if "://" not in path and not Path(path).exists():
+                raise ValueError(f"{key} must be a file or a folder, got {path}: no such file")
