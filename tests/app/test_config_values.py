@@ -68,7 +68,7 @@ WRONG = [
     ("reconstruct", ["recording=docs", "ckpt=setnet_small"], "recording must be an event file"),
     ("calibrate", ["recording=docs", "task=threshold", "save=a.yaml"], "save must be null for tas"),
     ("live", ["recording=docs", "threads=0"], "threads must be in 1..1024, got 0"),
-    ("live", ["recording=docs", "threads=10000000000"], "threads must be in 1..1024, got 100000000"),
+    ("live", ["recording=docs", "threads=10000000000"], "threads must be in 1..1024, got 10000000"),
     ("live", ["recording=x", "host=1.5"], "host must be a word, got 1.5"),
     ("train", ["data.large=5"], "data.large must be a mapping or null, got 5"),
     ("train", ["augment=views", "augment.max_view_shift_px=2.5"],
