@@ -4,9 +4,9 @@ Made anew: docs/figures/nine_views.webp, and the sections between the marks `rep
 docs/tables.md and docs/results.md: scores of test clips of the photographs in PHOTOS
 (data=test_photos), each simulated once for all networks, beside the published ones whose weights
 are in `--published`, without which their rows stay as they are and the note says so; of
-data=test_footage, with `--footage`, a still scene through air; and of sensors with random faults
-(sensor=randomized).  Without PHOTOS only the film.  The cards are given the scores, too, and those
-of data=test_targets.
+data=test_footage, with `--footage`, a still scene through air; of sensors with random faults
+(sensor=randomized); and without turbulence (turbulence=none).  Without PHOTOS only the film.  The
+cards are given the scores, too, and those of data=test_targets.
 """
 
 import argparse
@@ -45,6 +45,9 @@ AIR = ("turbulence=strong", "turbulence.atmosphere.tilt_correlation_half_length_
 PAPER, ONE_VIEW = "nine views, E2VID", "one view, E2VID"
 LARGE, MEDIUM = "nine views, SetNet large", "nine views, SetNet medium"
 SMALL, SINGLE = "nine views, SetNet small", "one view, SetNet medium"
+E2VID_PLUS = "one view, E2VID+, no turbulence, 1.1 h"
+HYPERE2VID = "one view, HyperE2VID, no turbulence, 1.1 h"
+ETNET = "one view, ET-Net, no turbulence, 1.1 h"
 ROWS = {  # what it is: a network in weights/, how many of the nine views it is given
     LARGE: ("setnet_large", 9),
     MEDIUM: ("setnet_medium", 9),
@@ -52,7 +55,12 @@ ROWS = {  # what it is: a network in weights/, how many of the nine views it is 
     PAPER: ("lf3x3", 9),
     SINGLE: ("setnet_medium", 1),
     ONE_VIEW: ("single256", 1),
-    "one view, E2VID+, no turbulence, 1.1 h": ("clean/e2vid_plus", 1),
+    E2VID_PLUS: ("clean/e2vid_plus", 1),
+}
+CLEAN = {  # trained without turbulence
+    E2VID_PLUS: ("clean/e2vid_plus", 1),
+    HYPERE2VID: ("clean/hypere2vid", 1),
+    ETNET: ("clean/etnet", 1),
 }
 BASELINES = {  # their files in the folder of published weights
     "firenet_plus": ["FireNet+/firenet_plus_state_dict.pth"],
@@ -78,6 +86,11 @@ VIEWS = {  # differences, clip by clip: of nine views and one
 }
 MEDIUM_AGAINST_ONE_VIEW = {"Δ SetNet medium, nine views − E2VID, one view": (MEDIUM, ONE_VIEW)}
 BEST = {"Δ nine views, SetNet medium − E2VID": (MEDIUM, PAPER)}
+AGAINST_FIRENET = {  # clip by clip
+    "Δ E2VID+ − published FireNet+": (E2VID_PLUS, FIRENET),
+    "Δ HyperE2VID − published FireNet+": (HYPERE2VID, FIRENET),
+    "Δ ET-Net − published FireNet+": (ETNET, FIRENET),
+}
 NETWORKS = BEST | {  # of networks
     "Δ nine views, SetNet small − E2VID": (SMALL, PAPER),
     "Δ nine views, SetNet large − medium": (LARGE, MEDIUM),
@@ -102,8 +115,13 @@ class Table(NamedTuple):
 TABLES = {  # of what is measured
     "data=test_photos": (
         Table("README.md", "results", HEADLINE, {}, SCORES),
-        Table("docs/tables.md", "photos", (*ROWS, *OTHERS), VIEWS | MEDIUM_AGAINST_ONE_VIEW),
+        Table(
+            "docs/tables.md", "photos", (*(ROWS | CLEAN), *OTHERS), VIEWS | MEDIUM_AGAINST_ONE_VIEW
+        ),
         Table("docs/results.md", "differences", (), NETWORKS),
+    ),
+    "data=test_photos turbulence=none": (
+        Table("docs/tables.md", "clean", (*CLEAN, FIRENET), AGAINST_FIRENET),
     ),
     "data=test_footage": (
         Table("docs/tables.md", "footage", tuple(ROWS), MEDIUM_AGAINST_ONE_VIEW),
@@ -260,14 +278,15 @@ def main() -> None:
     photos = [f"scene.root={given.root}"]
     asked = {
         "data=test_photos": photos,
+        "data=test_photos turbulence=none": photos,
         "data=test_photos sensor=randomized": photos,
         "data=test_targets": [],
     }
     if given.footage:
         asked["data=test_footage"] = [f"turbulence.footage={given.footage}", *photos]
-    chosen = ROWS | (OTHERS if given.published else {})
+    chosen = ROWS | CLEAN | (OTHERS if given.published else {})
     rows = {row: load_shipped(*what, given.published) for row, what in chosen.items()}
-    cards = {name: row for row, (name, _) in reversed(ROWS.items())}  # the row of most views
+    cards = {name: row for row, (name, _) in reversed((ROWS | CLEAN).items())}  # of most views
     for protocol, overrides in asked.items():
         shown = {row for table in TABLES[protocol] for row in table.all_rows}
         values = score_clips(
@@ -278,8 +297,8 @@ def main() -> None:
             document = HOME / table.document
             text = format_table(values, table, document.read_text())
             replace_section(document, table.section, text)
-        for name, row in cards.items():
-            update_card(files.WEIGHTS / f"{name}.md", protocol, commit, values[row])
+        for name in (name for name, row in cards.items() if row in shown):
+            update_card(files.WEIGHTS / f"{name}.md", protocol, commit, values[cards[name]])
 
 
 if __name__ == "__main__":

@@ -279,7 +279,7 @@ def _send_clips(clips: _ClipSource, indices: Sequence[int], sender: Connection) 
         sender.send_bytes(pickle.dumps(drawn, pickle.HIGHEST_PROTOCOL))
 
 
-def _forkserver() -> multiprocessing.context.BaseContext:
+def _forkserver() -> multiprocessing.context.ForkServerContext:
     """Return a context whose processes are forks of one that has imported what they need, once: a
     fork of this process would take CUDA along, and new ones would all import at the same time.
     """
