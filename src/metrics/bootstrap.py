@@ -13,11 +13,12 @@ import numpy as np
 from scipy.special import stdtr
 
 RESAMPLES, LEVEL = 4000, 0.95
+Rows = Sequence[Sequence[float] | np.ndarray] | np.ndarray
 
 
 def bootstrap_interval(
-    values: Sequence[float], weights: Sequence[float] | None = None,
-    groups: Sequence[Hashable] | None = None,
+    values: Sequence[float] | np.ndarray, weights: Sequence[float] | np.ndarray | None = None,
+    groups: Sequence[Hashable] | np.ndarray | None = None,
 ) -> tuple[float, float]:  # fmt: skip
     """Return the 95 % interval of the mean of `values`, one per clip; see
     `bootstrap_difference_interval`."""
@@ -25,8 +26,9 @@ def bootstrap_interval(
 
 
 def bootstrap_difference_interval(
-    ours: Sequence[Sequence[float]], theirs: Sequence[Sequence[float]] | None,
-    weights: Sequence[float] | None = None, groups: Sequence[Hashable] | None = None,
+    ours: Rows, theirs: Rows | None,
+    weights: Sequence[float] | np.ndarray | None = None,
+    groups: Sequence[Hashable] | np.ndarray | None = None,
 ) -> tuple[float, float]:  # fmt: skip
     """Return the interval of mean(ours) - mean(theirs); rows are seeds, columns the same clips.
 
@@ -41,12 +43,13 @@ def bootstrap_difference_interval(
     """
     rng = np.random.default_rng(0)
     clips = len(ours[0])
-    if any(len(row) != clips for row in [*ours, *(theirs or [])]):
+    if any(len(row) != clips for row in [*ours, *([] if theirs is None else theirs)]):
         raise ValueError(f"every seed must have the same {clips} clips")
-    places = {group: n for n, group in enumerate(dict.fromkeys(groups or range(clips)))}
+    groups = range(clips) if groups is None else groups
+    places = {group: n for n, group in enumerate(dict.fromkeys(groups))}
     if len(places) < 2:
         return math.nan, math.nan
-    members = np.array([places[group] for group in groups or range(clips)])
+    members = np.array([places[group] for group in groups])
     picked = rng.integers(len(places), size=(RESAMPLES, len(places)))
     shares = np.ones(clips) if weights is None else np.asarray(weights, dtype=float)
     means = _means(ours, shares, members, picked, rng)
@@ -75,7 +78,7 @@ def compute_interval_coverage(groups: int) -> float:
 
 
 def _means(
-    rows: Sequence[Sequence[float]], shares: np.ndarray, members: np.ndarray, picked: np.ndarray,
+    rows: Rows, shares: np.ndarray, members: np.ndarray, picked: np.ndarray,
     rng: np.random.Generator,
 ) -> np.ndarray:  # fmt: skip
     values, seeds = np.asarray(rows, dtype=float), len(rows)

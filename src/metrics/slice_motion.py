@@ -3,12 +3,13 @@ its mean place, what moves uniformly should draw a straight line.
 """
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Num
 
 ITERATIONS = 5  # of least squares
 MAX_SHIFT = 8.0  # places
 MIN_CORRELATION = 0.5  # of a row with the shifted mean row; below, the row does not show the scene
 MOST_LOST = 0.5  # of the rows
+SLICES = ("line", "circle", "spin")
 
 
 def residual_displacement_px(rows: Float[np.ndarray, "frames places"]) -> float:
@@ -47,7 +48,7 @@ def correlation(a: Float[np.ndarray, "*size"], b: Float[np.ndarray, "*size"]) ->
 
 
 def measure_static_scene(
-    film: Float[np.ndarray, "frames h w"], line_spacing_px: int
+    film: Num[np.ndarray, "frames h w"], line_spacing_px: int
 ) -> dict[str, float]:
     """Return `residual_displacement_px` of a static scene, the median over rows and columns
     `line_spacing_px` apart and as far from the border (nan where none shows the scene), `contrast`,
@@ -56,7 +57,7 @@ def measure_static_scene(
 
     Raises ValueError where there is no such row or column.
     """
-    step = line_spacing_px
+    film, step = np.asarray(film, float), line_spacing_px  # differences of uint8 would wrap
     inside = film[:, step : film.shape[1] - step, step : film.shape[2] - step]
     if step < 1 or 0 in inside.shape:
         raise ValueError(f"still must be in 1..{(min(film.shape[1:]) - 1) // 2} pixels, got {step}")
@@ -79,8 +80,11 @@ def measure_slice_motion(
     `circle` or a ray that turns with the scene (`spin`), in places.
 
     Nothing is static on a circle, and nothing moves along such a ray.  `object_brightness`: whether
-    what moves is `bright` or `dark` against the median in time, or `any`; ValueError for another.
+    what moves is `bright` or `dark` against the median in time, or `any`.  Raises ValueError for
+    another of either.
     """
+    if kind not in SLICES:
+        raise ValueError(f"kind must be one of {', '.join(SLICES)}, got {kind}")
     values = {}
     if kind != "circle":
         values["residual_displacement_px"] = residual_displacement_px(rows)

@@ -110,3 +110,14 @@ def test_of_one_clip_or_photograph_there_is_no_interval(values, groups):
 def test_rows_must_be_of_the_same_clips():
     with pytest.raises(ValueError, match="same 2 clips"):
         bootstrap_difference_interval([[1.0, 2.0]], [[1.0]])
+
+
+def test_arrays_are_what_lists_are():
+    values, others = np.random.default_rng(0).random((2, 2, 6))
+    groups = np.array([0, 0, 1, 1, 2, 2])
+    assert bootstrap_interval(values[0], groups=groups) == bootstrap_interval(
+        list(values[0]), groups=list(groups)
+    )
+    assert bootstrap_difference_interval(values, others) == bootstrap_difference_interval(
+        values.tolist(), others.tolist()
+    )

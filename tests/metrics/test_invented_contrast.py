@@ -42,3 +42,13 @@ def test_all_seen_and_nothing_seen_have_none():
     frame, has_events = scene()
     for mask in (np.zeros_like(has_events), find_unseen_pixels(np.zeros_like(has_events))):
         assert math.isnan(invented_contrast(frame, mask))
+
+
+@pytest.mark.parametrize("kind", [np.uint8, float])
+def test_masks_of_numbers_are_those_of_truth_values(kind):
+    has_events = np.zeros((64, 64), bool)
+    has_events[20, 30] = True
+    unseen = find_unseen_pixels(has_events)
+    assert np.array_equal(find_unseen_pixels(has_events.astype(kind)), unseen)
+    frame = np.random.default_rng(0).random((64, 64))
+    assert invented_contrast(frame, unseen.astype(kind)) == invented_contrast(frame, unseen)

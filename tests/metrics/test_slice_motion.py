@@ -94,3 +94,14 @@ def test_flicker_is_change_over_contrast():
     assert slice_motion.measure_static_scene(restless, 8)["flicker"] == pytest.approx(
         0.1 / scene.std(), rel=1e-4
     )
+
+
+def test_a_film_of_uint8_flickers_as_its_floats_do():
+    film = np.random.default_rng(0).integers(0, 256, (6, 24, 24)).astype(np.uint8)
+    found = slice_motion.measure_static_scene(film, 4)
+    assert found["flicker"] == slice_motion.measure_static_scene(film.astype(float), 4)["flicker"]
+
+
+def test_a_slice_of_another_kind_is_refused():
+    with pytest.raises(ValueError, match="kind must be one of line, circle, spin, got disc"):
+        slice_motion.measure_slice_motion(np.eye(8), "disc")

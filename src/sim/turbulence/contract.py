@@ -27,7 +27,7 @@ class ClipTurbulence(Protocol):
 
     @property
     def metadata(self) -> Mapping[str, float | int | str]:
-        """What is recorded about the clip; `severity` (weak, medium, strong or none) is there."""
+        """What is recorded of the clip, with `severity`: none, weak, medium, strong or extreme."""
 
     def degrade(self, frames: Frames, generator: Generator, *, crop: Crop | None = None) -> Views:
         """Return every view of `crop` (None: the whole frame); linear light, float32."""
