@@ -289,7 +289,7 @@ def test_a_wrong_recipe_is_named(stages, said, tmp_path):
         (["lf3x3", "nice=25"], r"nice must be a whole number in 0\.\.19, got 25"),
         (["lf3x3", f"clone={ROOT / 'docs'}"], "clone must be a new folder or a clone of this"),
         (["lf3x3", "clone=/dev/null/x"], "clone must be a folder to make, got /dev/null/x: fatal"),
-        (["clean/etnet", "scene.rot=x"], "stage training of recipe clean/etnet: .*rot"),
+        (["clean/etnet", "scene.rot=x"], "stage short_sequences of recipe clean/etnet: .*rot"),
     ],
 )
 def test_a_wrong_command_line_is_named(words, said, monkeypatch):
