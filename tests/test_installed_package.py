@@ -14,6 +14,7 @@ import pytest
 import lightfield_events
 import lightfield_events.__main__
 from setup import rename_imports
+from src.deploy.cost import torch_threads
 from src.deploy.runtime import EventListRuntime
 from src.models import files
 from tests.conftest import ROOT
@@ -71,10 +72,12 @@ def check_package(place: Path, folder: Path, compiled: bool) -> None:
     (folder / "src" / "__init__.py").write_text("OTHER = 1\n")
     np.save(folder / "events.npy", events := made_events())
     path = os.pathsep.join([str(place), sysconfig.get_paths()["purelib"]])
+    # One thread on both sides: sums of two are rounded otherwise.
     environment = os.environ | {"PYTHONPATH": path, "NUMBA_DISABLE_JIT": str(int(not compiled))}
+    environment["OMP_NUM_THREADS"] = "1"
     command = [sys.executable, "-W", "ignore", "-c", USE, str(place), "events.npy"]
     subprocess.run(command, cwd=folder, env=environment, check=True, timeout=600)
-    with np.load(folder / "out.npz") as found:
+    with np.load(folder / "out.npz") as found, torch_threads(1):
         net, columns = files.load("setnet_small"), [events[name] for name in COLUMNS]
         columns[0] = columns[0] * 1e-6
         size = {"height": 24, "width": 32, "form": "float32", "threads": 1}

@@ -51,5 +51,16 @@ def refuse_missing_inputs(cfg: Mapping[str, Any]) -> None:
     for key in INPUTS:
         value = cfg.get(key) if key not in missing else None
         for path in map(str, [value] if isinstance(value, str) else value or []):
-            if "://" not in path and not Path(path).exists():
-                raise ValueError(f"{key} must be a file or a folder, got {path}: no such file")
+            if why := _why_not_there(path):
+                raise ValueError(f"{key} must be a file or a folder, got {path}: {why}")
+
+
+def _why_not_there(path: str) -> str:
+    """Return why `path` is no file or folder; "" for one and for a live address."""
+    if "://" in path:
+        return ""
+    try:
+        Path(path).stat()
+    except OSError as error:
+        return str(error.strerror).lower()
+    return ""

@@ -12,12 +12,13 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
+from src.metrics.slice_motion import SLICES
 from src.recordings.output import resize_picture
 
 Points = Float[np.ndarray, "places 2"]
 Slice = Float[np.ndarray, "frames places"]
 BORDER = cv2.BORDER_REPLICATE
-KINDS = ("line", "circle", "spin", "still")
+KINDS = (*SLICES, "still")
 
 
 def cut_slice(

@@ -175,7 +175,7 @@ def hash_simulation_code() -> str:
     """Return a hash of the code and tables that make clips, `list_simulation_files`."""
     digest, root = hashlib.sha256(), Path(src.sim.__file__).parent.parent
     for path in list_simulation_files():
-        digest.update(path.relative_to(root).as_posix().encode() + read_effective_content(path))
+        digest.update(path.relative_to(root).as_posix().encode() + read_without_comments(path))
     return digest.hexdigest()[:12]
 
 
@@ -188,7 +188,7 @@ def list_simulation_files() -> list[Path]:
     return sorted([*used, home / UPSTREAM, home.parent / MEASURED])
 
 
-def read_effective_content(path: Path) -> bytes:
+def read_without_comments(path: Path) -> bytes:
     """Return what a file says: of code, all but comments, docstrings and layout."""
     if path.suffix != ".py":
         return path.read_bytes()

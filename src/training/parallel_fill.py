@@ -22,6 +22,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from src import add_package_prefix
 from src.sim.pipeline import ClipParameters, Pipeline, crop_frames
 from src.sim.turbulence import Turbulence
 from src.sim.turbulence.clip_plan import TilePlan
@@ -284,7 +285,7 @@ def _forkserver() -> multiprocessing.context.ForkServerContext:
     fork of this process would take CUDA along, and new ones would all import at the same time.
     """
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([__name__, "src.app.simulation"])
+    context.set_forkserver_preload([__name__, add_package_prefix("src.app.simulation")])
     return context
 
 

@@ -62,6 +62,7 @@ WRONG = [
     ("convert", ["recording=x"], "out must be given: out=..."),
     ("convert", ["recording=x", "out=y.h5"], "recording must be a file or a folder, got x: no"),
     ("reconstruct", ["recording=x"], "recording must be a file or a folder, got x: no such file"),
+    ("reconstruct", [f"recording={'x' * 300}"], "x: file name too long"),
     ("report", ["run=[docs,x]"], "run must be a file or a folder, got x: no such file"),
     ("calibrate", ["task=air", "video=x"], "video must be a file or a folder, got x: no such file"),
     ("calibrate", ["task=air"], "video must be given: video=..."),

@@ -449,11 +449,11 @@ def test_comments_docstrings_and_layout_of_code_are_not_hashed(tmp_path):
     contents = []
     for text in texts:
         (tmp_path / "a.py").write_text(text)
-        contents.append(disk_caches.read_effective_content(tmp_path / "a.py"))
+        contents.append(disk_caches.read_without_comments(tmp_path / "a.py"))
     assert contents[0] == contents[1] != contents[2]
 
 
 def test_code_is_hashed_once_a_process(monkeypatch):
     before = hash_simulation_code()
-    monkeypatch.setattr(disk_caches, "read_effective_content", None)
+    monkeypatch.setattr(disk_caches, "read_without_comments", None)
     assert hash_simulation_code() == before
